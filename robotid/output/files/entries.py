@@ -214,7 +214,6 @@ def _determined(found: TorqueIdentification) -> dict[str, Any]:
 
 
 def _without_value(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a parameter's entry without the keys that require data."""
     return {key: x for key, x in entry.items() if key not in ("value", "at_bound")}
 
 
@@ -307,7 +306,6 @@ def _consistency(found: Identified) -> dict[str, Any]:
 
 
 def _band(identification: TorqueIdentification, evaluation: Evaluation) -> dict[str, Any]:
-    """Return the 95 % band of the predicted torque: its half width, and its coverage."""
     recording, band = evaluation.recording, identification.band(evaluation)
     covered = band.coverage(
         recording.trajectory.tau, evaluation.torques["estimate"], recording.mask
@@ -410,7 +408,6 @@ def _covariance(found: "PositionIdentification") -> dict[str, Any]:
 
 
 def _controller(found: "PositionIdentification") -> dict[str, Any]:
-    """Return kind, torque limits and sampling rate of the controller."""
     limits = dict(zip(found.model.joints, found.fit.loops.limit.tolist(), strict=True))
     stated = {joint: x for joint, x in limits.items() if math.isfinite(x)} or None
     return {"kind": found.loop.kind, "effort_limit": stated, "rate": found.loop.rate}

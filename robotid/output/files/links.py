@@ -125,7 +125,6 @@ def _links(
 
 
 def _leader(model: RobotModel, joint: Joint) -> tuple[str, float, float]:
-    """Return the joint that a mimic joint follows, the ratio and the offset."""
     row = model.pin_model.joints[model.pin_model.getJointId(joint.name)].idx_v
     ratios = model.velocity_map[row, -len(model.joints) :]
     leader = int(np.abs(ratios).argmax())
@@ -133,7 +132,6 @@ def _leader(model: RobotModel, joint: Joint) -> tuple[str, float, float]:
 
 
 def _pose(joint: Joint, position: float) -> Array:
-    """Return the pose of a joint's child in its parent."""
     R, axis = Rotation.from_euler("xyz", joint.rpy), np.array(joint.axis)
     displacement = position * axis / np.linalg.norm(axis)
     if joint.type == "prismatic":

@@ -214,7 +214,6 @@ def _mjcf(
 def _add_motion(
     body: ET.Element, link: SimulatedLink, values: Mapping[str, float], servos: _Servos
 ) -> None:
-    """Add the inertial of a link, and the joint that moves it."""
     if link.inertial is not None:
         moments, axes = principal_moments(link.inertial)
         x, y, z = np.maximum(moments, 0.0)  # their sums are possible moments in any rounding
@@ -261,7 +260,6 @@ def _add_drives(
     values: Mapping[str, float],
     servos: _Servos,
 ) -> None:
-    """Add drives of several joints as tendons, joints that follow others, and actuators."""
     tendons, equality, actuators = (
         ET.SubElement(top, tag) for tag in ("tendon", "equality", "actuator")
     )
@@ -308,7 +306,6 @@ def _add_loops(top: ET.Element, model: RobotModel, bodies: Mapping[str, ET.Eleme
 
 
 def _drive(name: str, values: Mapping[str, float]) -> dict[str, str]:
-    """Return the attributes that state the terms of a drive."""
     stated = {key: values.get(f"{name}.{term}") for term, key in _ATTRIBUTES.items()}
     return {key: numbers_text([value]) for key, value in stated.items() if value is not None}
 

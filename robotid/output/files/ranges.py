@@ -185,7 +185,6 @@ def _body(pi: Array, covariance: Array, sources: Sequence[str], quantile: float)
 
 
 def _joint_source(sources: Sequence[str]) -> str:
-    """Return the source of a function of several parameters."""
     return sources[0] if len(set(sources)) == 1 else "mixed"
 
 
@@ -213,7 +212,6 @@ def _range(
 
 
 def _of_logs(ends: Mapping[str, Any], interval: Sequence[float], least: float) -> dict[str, Any]:
-    """Return a range with the interval of the next log."""
     low, high = map(float, interval)
     return {**ends, "low": max(low, least), "high": high, "source": "logs"}
 
@@ -357,7 +355,6 @@ def _quantile(content: Mapping[str, Any]) -> float:
 
 
 def _nominal(result: Result, names: list[str]) -> list[float]:
-    """Return the identified values of gains, delays and zeros."""
     stated = {entry["name"]: float(entry["value"]) for entry in result.content["drive_parameters"]}
     return [stated[name] for name in names]
 
@@ -384,7 +381,6 @@ def _bodies(model: RobotModel, values: Array) -> dict[str, Any]:
 
 
 def _drives(model: RobotModel, names: list[str], values: Array) -> dict[str, dict[str, Any]]:
-    """Return the samples of drive terms, gains, delays and zeros, by drive."""
     found: dict[str, dict[str, Any]] = {}
     for k in range(model.layout.n_inertial, len(names)):
         drive, _, term = names[k].rpartition(".")

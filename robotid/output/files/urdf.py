@@ -149,7 +149,6 @@ def _content(
     *,
     dynamics: Projection | bool,
 ) -> bytes:
-    """Return the original URDF with new parameters of links and drives."""
     document = xml_splice.parse(original, Path(model.tree.path).name)
     changed = {
         link: pi
@@ -192,7 +191,6 @@ def _facts(model: RobotModel, pi: Array, places: Sequence[LinkPlace]) -> dict[st
 
 
 def _projected_facts(dynamics: Projection | bool) -> dict[str, Any]:
-    """Return the projection of friction on ``<dynamics>``, if there is one."""
     if not isinstance(dynamics, Projection) or not dynamics.drives:
         return {}
     return {"projected_dynamics": {drive.name: drive.to_dict() for drive in dynamics.drives}}
@@ -311,7 +309,6 @@ def _is_as_stated(parameters: Array, stated: Inertial | None) -> bool:
 
 
 def _inertial(parameters: Array) -> list[str]:
-    """Return an ``<inertial>`` about the centre of mass, line by line."""
     body = central_inertial(parameters)
     size = np.sqrt(np.trace(pseudo_inertia(parameters)[0][:3, :3]) / body.mass)  # [m]
     com = np.where(np.abs(body.com) > ROUNDING * size, body.com, 0.0)

@@ -223,7 +223,6 @@ def page(title: str, header: str, sections: Mapping[str, Section | tuple[str, st
 
 
 def _section(key: str, section: Section) -> str:
-    """Return the HTML of a section."""
     head = f'<h2 id="{key}">{section.title}</h2>'
     html = f"{head}\n{section.html}"
     if section.is_open is not None:
@@ -252,7 +251,6 @@ def scaffold(
 
 @cache
 def _allowed(script: str) -> str:
-    """Return the entry of a content security policy that allows this script."""
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
     return f"'sha256-{digest}'"
 

@@ -159,7 +159,6 @@ def _by_recording(result: Mapping[str, Any]) -> dict[tuple[Any, ...], dict[str, 
 
 
 def _signals(result: Mapping[str, Any], key: tuple[Any, ...]) -> dict[str, Any]:
-    """Return the signal settings of a validation recording, and its number of samples used."""
     entries = [entry for entry in result["inputs"] if entry.get("role") == "validation"]
     entry = entries[_recordings(result, "validation").index(key)]
     return {**entry["signals"], "rows": entry["rows_used"]}
@@ -233,7 +232,6 @@ def _base_parameters(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any
 
 
 def _largest(row: Mapping[str, Any]) -> float:
-    """Return the largest difference of a parameter; -1 if none is known."""
     return max((abs(d) for d in row["differences"] if d is not None), default=-1.0)
 
 
@@ -245,7 +243,6 @@ def _difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> float | Non
 
 
 def _chosen(result: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a job without its files, which are inputs."""
     return {k: v for k, v in result["settings"].items() if k not in _FILES}
 
 
@@ -317,13 +314,11 @@ def _verdict(result: Mapping[str, Any]) -> str:
 
 
 def _columns(content: Mapping[str, Any], key: str, form: str, words: str = "{}") -> list[Column]:
-    """Return a column for each result, with "key label" as its key."""
     labels = [result["label"] for result in content["results"]]
     return [(words.format(label), form, f"{key} {label}") for label in labels]
 
 
 def _cells(content: Mapping[str, Any], key: str, values: Sequence[Any]) -> dict[str, Any]:
-    """Return the values of the results by the keys of their columns."""
     labels = [result["label"] for result in content["results"]]
     return {f"{key} {label}": x for label, x in zip(labels, values, strict=True)}
 
@@ -475,7 +470,6 @@ def _kind(failure: Mapping[str, str]) -> str:
 
 
 def _more(count: int, file: str) -> str:
-    """Return a note on the rows that are not shown."""
     return block("fleet.more", count=count - _ROWS, file=file) if count > _ROWS else ""
 
 

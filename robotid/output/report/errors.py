@@ -170,7 +170,6 @@ def error_bars(
 
 
 def _others(quantity: Quantity, measured: Mapping[str, Any]) -> dict[str, float]:
-    """Return the errors of the other predictions that are known [%]."""
     errors = {key: measured.get(f"{key}_relative_error_pct") for key in quantity.marks}
     return {key: error for key, error in errors.items() if error is not None}
 
@@ -183,7 +182,6 @@ def _at(value: float) -> str:
 def _picture(
     quantity: Quantity, row: int, joint: str, error: float, measured: Mapping[str, Any]
 ) -> str:
-    """Return the bar of a joint with the markers of other predictions."""
     others, words = "", []
     for key, value in _others(quantity, measured).items():
         mark = quantity.marks[key]

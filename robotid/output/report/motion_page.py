@@ -62,7 +62,6 @@ def write_motion_page(
 
 
 def _head(model: RobotModel, content: Mapping[str, Any]) -> str:
-    """Return the heading, and the criterion and constraints of the design."""
     condition, how = content["condition_number"], f"{content['seconds']:.1f} s"
     if content["starts"]:
         settled = "converged" if content["converged"] else "not converged: allow more seconds"
@@ -126,7 +125,6 @@ def _nearest(where: str, distance: float, time: float, required: float, between:
 
 
 def _over_time(model: RobotModel, content: Mapping[str, Any], course: Course) -> str:
-    """Return charts of the use of each limit, and of unlimited quantities."""
     charts = []
     for k, kind in enumerate(LIMITS):
         is_limited = np.isfinite(course.limits.sizes[k])
@@ -153,7 +151,6 @@ def _lines(model: RobotModel, values: Array, joints: Array) -> list[Series]:
 
 
 def _expected(preview: Preview) -> str:
-    """Return the standard errors expected of a log of the motion, as paragraphs."""
     found, noise = preview.expected, preview.noise
     ratio = np.minimum(preview.base_error / preview.plausible, 1.0)
     order = np.argsort(-ratio, kind="stable")[:_NAMED]

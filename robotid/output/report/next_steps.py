@@ -93,7 +93,6 @@ def _without(source: Sequence[str], flags: Sequence[str]) -> list[str]:
 
 
 def _key(flag: str, value: str) -> tuple[str, str]:
-    """Return the key of a flag: its name, and the joint if its value is JOINT=VALUE."""
     name, sign, _ = value.partition("=")
     return flag, name if sign else ""
 
@@ -203,7 +202,6 @@ _Maker: TypeAlias = "Callable[[TorqueIdentification, Origin, Sequence[Cause]], S
 
 
 def _of_verdict(found: TorqueIdentification) -> list[Cause]:
-    """Return the causes of a verdict that no finding names."""
     causes, predictions = [], found.predictions
     measured = [(j, m) for metrics in predictions.values() for j, m in metrics.per_joint.items()]
     rescaled = {joint for f in found.findings if f.code == "gain_change" for joint in f.joints}
@@ -230,7 +228,6 @@ def _names_cause(cause: Cause) -> bool:
 
 
 def _named(causes: Sequence[Cause], default: Sequence[str] = ()) -> str:
-    """Return the joints of causes, as part of a sentence."""
     return listed(dict.fromkeys(j for cause in causes for j in cause.joints) or default, NAMED)
 
 
@@ -259,7 +256,6 @@ def _scale(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause])
 
 
 def _gain_flags(origin: Origin) -> list[tuple[str, str]]:
-    """Return the joint and the value of each gain that a command states."""
     stated = [value for flag, value in pairwise(origin.source) if flag == "--gain"]
     return [(joint, value) for joint, _, value in (text.partition("=") for text in stated)]
 
@@ -307,7 +303,6 @@ def _pin(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -
 
 
 def _terms(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    """Return the step that adds missing drive terms to the model."""
     codes = {cause.code for cause in causes}
     entries: dict[str, list[str | DriveTerm]] = {
         finding.joints[0]: [spring_family(finding.evidence["turned"], COUNTERBALANCE)]
@@ -378,7 +373,6 @@ def _richer(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]
 
 
 def _another_log(origin: Origin) -> tuple[str, ...]:
-    """Return the blocks that repeat the identification with one more log."""
     if not origin.job and origin.source:
         urdf, *others = origin.source
         return (Origin((urdf, _NEW, *others), origin.folder).again(),)

@@ -86,7 +86,6 @@ def shown_evaluation(found: TorqueIdentification) -> Evaluation:
 
 
 def _row_of(identification: TorqueIdentification, joint: str) -> int:
-    """Return the index of a joint's torque row."""
     require_kind(joint, str, "joint", "the name of a joint")
     names = identification.model.row_names
     if joint not in names:
@@ -277,6 +276,5 @@ def _residual(torque: JointTorque, dependence: Dependence, link: str) -> Chart:
 
 
 def _first(torque: JointTorque) -> Array:
-    """Return samples spread evenly over the first recording."""
     rows = np.flatnonzero(torque.rows.recording == 0)
     return rows[spread_rows(len(rows), _POINTS)]

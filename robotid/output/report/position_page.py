@@ -4,8 +4,6 @@ from collections.abc import Iterator, Sequence
 from html import escape
 from statistics import geometric_mean
 
-import numpy as np
-
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
@@ -16,7 +14,7 @@ from robotid.identification.closed_loop.position_errors import (
     pool_positions,
 )
 from robotid.output.files.entries import loop_parameters
-from robotid.output.pages.charts import TONES, Chart, Series, chart_html
+from robotid.output.pages.charts import Chart, Series, chart_html
 from robotid.output.pages.html import block, code, number, paragraphs, table, text
 from robotid.output.report.errors import POSITION, Errors, worst_errors
 from robotid.output.report.next_steps import Origin
@@ -71,27 +69,17 @@ def _mean(errors: Array | None) -> float | None:
 
 
 def _facts(found: PositionIdentification) -> dict[str, str]:
-    """Return the mean error on the first validation log, and those of other predictions."""
     run = (found.validation or found.fitted)[0]
     kind, ours = "not fitted" if found.validation else "fitted", _mean(run.rmse)
     over = f" over {DRIFTS:g} s" if run.is_driven else ""
     error = number(None if ours is None else ours / POSITION.scale, ".3g").html
-    facts = {
+    return {
         f"Simulated position error{over}, {kind}": f"<strong>{error} {_unit(run)}</strong>, "
         f"geometric mean of {len(run.rmse)} joint{'s' * (len(run.rmse) > 1)}"
     }
-    times = [
-        f"{mark.words} {(ratio := theirs / ours):{'.2g' if ratio < 99.5 else '.0f'}} ×"
-        for key, mark in POSITION.marks.items()
-        if ours and (theirs := _mean(run.baselines.get(key)))
-    ]
-    return facts | (
-        {"Other predictions, relative to this error": ", ".join(times)} if times else {}
-    )
 
 
 def _method(found: PositionIdentification) -> str:
-    """Return a description of the fit and its logs."""
     fitted, validation = ([e.name for e in part] for part in (found.fitted, found.validation))
     return (
         f"{len(found.estimate.theta)} parameters of {len(found.model.joints)} joints were fitted "
@@ -101,23 +89,11 @@ def _method(found: PositionIdentification) -> str:
 
 
 def _horizons(runs: Sequence[PositionEvaluation]) -> str:
-    """Return errors over the horizon of the simulation: a chart of the worst joints, and tables."""
+    """Return errors over the horizon of the simulation: tables."""
     joints, parts = runs[0].log.joints, list[str]()
     for run in runs:
         whole = {} if run.is_driven else {run.extent.end - run.extent.start: run.rmse}
         errors = {h: x / POSITION.scale for h, x in sorted((dict(run.horizons) | whole).items())}
-        if not parts and errors:
-            y = np.stack([*errors.values()])  # (horizons, n)
-            worst = np.argsort(-run.rmse)[:TONES]
-            series = [
-                Series(joints[j], y[:, j], f"tone-{k + 1}", is_weak=True)
-                for k, j in enumerate(worst)
-            ]
-            chart = Chart(
-                "position error over the horizon of the simulation", np.array([*errors]),
-                tuple(series), "horizon [s]", f"RMSE [{_unit(run)}]", logarithmic="xy", height=220,
-            )  # fmt: skip
-            parts.append(chart_html(chart, f"Error over horizon: {escape(run.name)}"))
         rows = [
             [code(joint), *(number(float(x[j]), "#.3g") for x in errors.values())]
             for j, joint in enumerate(joints)
@@ -132,7 +108,6 @@ def _horizons(runs: Sequence[PositionEvaluation]) -> str:
 def _positions(
     found: PositionIdentification, worst: str, kind: str, origin: Origin, replay: str
 ) -> str:
-    """Return charts of each joint in every log."""
     intro = block(f"report.{kind}s", drift=f"{DRIFTS:g}")
 
     def charts(run: PositionEvaluation, row: int, link: str, points: int) -> str:
@@ -150,7 +125,6 @@ def _positions(
 
 
 def _charts(run: PositionEvaluation, kind: str, j: int, link: str, points: int) -> str:
-    """Return charts of positions and position errors of a joint in a log."""
     log, joint, unit = run.log, run.log.joints[j], run.units[j]
     q, q_sim = log.q[:, j], run.q[:, j]
     positions = [Series("measured", q, "text"), Series("simulated", q_sim, "predicted")]
@@ -171,7 +145,6 @@ def _charts(run: PositionEvaluation, kind: str, j: int, link: str, points: int) 
 
 
 def _open_section(found: PositionIdentification) -> str:
-    """Return the parameters that positions and commands do not determine."""
     words = ["The logs determine all free parameters."]
     if found.undetermined:
         words = [f"The logs do not determine {listed(found.undetermined)}."]

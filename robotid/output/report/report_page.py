@@ -148,7 +148,6 @@ def first_screen(
 
 
 def _steps(steps: Sequence[Step]) -> str:
-    """Return the HTML of the next steps; nothing if there are none."""
     items = "".join(
         f"<li><p>{escape(step.words)}</p>"
         + "".join(f'<div class="copy">{command_html(text)}</div>' for text in step.blocks)
@@ -159,7 +158,6 @@ def _steps(steps: Sequence[Step]) -> str:
 
 
 def _cause(cause: Cause) -> str:
-    """Return one cause: its messages, and each finding where there are several."""
     findings = ""
     if len(cause.findings) > len(cause.messages):
         items = "".join(f"<li>{escape(finding.message)}</li>" for finding in cause.findings)

@@ -86,7 +86,6 @@ def parameter_section(
 
 
 def _parameter(entry: Mapping[str, Any], on_misfit: Collection[str]) -> dict[str, Any]:
-    """Return the row of a parameter: the URDF's value, the identified value and its source."""
     owner, _, term = entry["name"].rpartition(".")
     error, prior = _error(entry), entry.get("prior")
     value, uncertainty = with_error(entry["value"], error)
@@ -108,7 +107,6 @@ def _parameter(entry: Mapping[str, Any], on_misfit: Collection[str]) -> dict[str
 
 
 def _drive_table(entries: Sequence[Mapping[str, Any]]) -> str:
-    """Return the drive terms, one row per joint."""
     drives: dict[str, dict[str, Mapping[str, Any]]] = {}
     for entry in entries:
         owner, _, term = entry["name"].rpartition(".")
@@ -326,7 +324,6 @@ def variation_section(variation: Variation | None, torques: Mapping[str, str]) -
 
 
 def _varying(parameter: VaryingParameter, different: Collection[tuple[int, str]]) -> dict[str, Any]:
-    """Return the row of a parameter: its value in each log, and the prediction of the next."""
     prediction = parameter.prediction
     mean, error = with_error(prediction.mean, prediction.std_error)
     low, high = (with_error(float(x), prediction.std_error)[0] for x in prediction.ends)

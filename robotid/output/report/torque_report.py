@@ -41,7 +41,7 @@ def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "")
         quantity=TORQUE,
         counted=counted,
         facts=_facts(found),
-        made=block("report.made", method=escape(_method(found)), totals=escape(_totals(found))),
+        made=f"<p>{escape(_method(found))}</p>\n",
         errors=(block("report.torque_errors"), ""),
         curves=("Torques", _torques(found, worst[0], origin, replay)),
         friction=_friction(found, worst),
@@ -64,7 +64,6 @@ def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "")
 
 
 def _next_errors(found: TorqueIdentification) -> dict[str, str]:
-    """Return the expected RMS torque error of the next log with its unit, by row."""
     if found.variation is None:
         return {}
     rows = zip(found.model.row_names, found.model.row_units, next_errors(found), strict=True)
@@ -93,7 +92,6 @@ def _facts(found: TorqueIdentification) -> dict[str, str]:
 
 
 def _method(found: TorqueIdentification) -> str:
-    """Return a description of the fit and its logs."""
     fitted, validation = found.fitted, found.validation
     samples = sum(e.recording.extent.smooth for e in fitted)
     rows = sum(e.recording.extent.rows_used for e in fitted)
@@ -113,18 +111,6 @@ def _others(found: TorqueIdentification) -> str:
     return "There is no validation log" + "".join(f"; {line}" for line in lines)
 
 
-def _totals(found: TorqueIdentification) -> str:
-    """Return total mass, gravity torque and friction, for comparison with the verdict."""
-    scale_check = found.scale_check
-    shares = [f"{joint} {100 * share:.0f} %" for joint, share in scale_check.friction.items()]
-    before, after, _ = scale_check.masses
-    gravity = [f"{joint} {ratio:.2f}" for joint, ratio in scale_check.gravity.items()]
-    return (
-        f"Total mass {before:.2f} -> {after:.2f} kg. Gravity torque relative to the URDF: "
-        f"{listed(gravity)}. Friction relative to the torque: {listed(shares)}."
-    )
-
-
 def _chain(signals: SignalSettings) -> str:
     cutoff = "no filter"
     if signals.cutoff is not None:
@@ -137,7 +123,6 @@ def _chain(signals: SignalSettings) -> str:
 
 
 def _torques(found: TorqueIdentification, worst: str, origin: Origin, replay: str) -> str:
-    """Return charts of torques and residuals over time."""
     evaluations, model = found.validation or found.fitted, found.model
     intro = _intro(found, drawn(evaluations, model.row_names))
 
@@ -154,7 +139,6 @@ def _torques(found: TorqueIdentification, worst: str, origin: Origin, replay: st
 
 
 def _residuals(evaluations: Sequence[Evaluation], row: int) -> Iterator[Residual]:
-    """Yield the residuals of a joint, of the samples used."""
     for e in evaluations:
         motion, used = e.recording.trajectory, e.recording.mask[:, row].astype(bool)
         left = np.where(used, motion.tau[:, row] - e.torques["estimate"][:, row], np.nan)
@@ -162,7 +146,6 @@ def _residuals(evaluations: Sequence[Evaluation], row: int) -> Iterator[Residual
 
 
 def _intro(found: TorqueIdentification, shown: Sequence[Evaluation]) -> str:
-    """Return the description of the charts and their recordings."""
     band = "95 % band" if found.between is not None else "95 % band (for logs of the same day)"
     html = block("report.torques", band=band)
     html += "" if found.validation else block("report.no_validation")
@@ -174,7 +157,6 @@ def _intro(found: TorqueIdentification, shown: Sequence[Evaluation]) -> str:
 
 
 def _charts(found: TorqueIdentification, e: Evaluation, row: int, link: str, points: int) -> str:
-    """Return torque and residual of a joint in a recording."""
     band = found.band(e)
     name, unit = found.model.row_names[row], found.model.row_units[row]
     measured, recording = e.metrics["estimate"].per_joint.get(name), e.recording
@@ -193,7 +175,6 @@ def _charts(found: TorqueIdentification, e: Evaluation, row: int, link: str, poi
 
 
 def _friction(found: TorqueIdentification, worst: Sequence[str]) -> str:
-    """Return friction against speed of each joint, measured and identified."""
     model, layout = found.model, found.model.layout
     if model.is_static or all(term.is_inertia for _, term in layout.drive_parameters):
         return ""
@@ -225,7 +206,6 @@ def _drive_choices(found: TorqueIdentification) -> str:
 
 
 def _choice(drive: DriveChoice) -> str:
-    """Return the candidate friction terms of a joint, the selection, and its shape parameters."""
     selected = " + ".join(drive.families) or "no additional term"
     shapes = [
         f"{shape.name} = {shape.value:.3g} ± {shape.std_error:.2g} {shape.unit}"
@@ -272,7 +252,6 @@ def _relative_residual(torque: JointTorque) -> float:
 
 
 def _joint(torque: JointTorque, link: str) -> str:
-    """Return the table and the charts of a joint."""
     if not torque.used.any():
         return ""
 
@@ -300,7 +279,6 @@ def _caption(torque: JointTorque, name: str) -> str:
 
 
 def _parts(torque: JointTorque) -> str:
-    """Return the table of torque components, with the terms of those that have several."""
     rms, rows = torque.rms, []
     for name in (*sorted(torque.present, key=lambda name: -rms[name]), "residual", "measured"):
         sizes = {term: torque.size(x) for term, x in torque.terms.get(name, {}).items()}

@@ -225,7 +225,6 @@ def _keyframes(t: Array, rate: float, most: int) -> Array:
 
 
 def _gaps(t: Array) -> list[int]:
-    """Return the samples before gaps of the recording."""
     steps = np.diff(t)
     return np.flatnonzero((steps > _GAP) & (steps > _TIMES * np.median(steps))).tolist()
 

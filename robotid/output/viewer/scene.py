@@ -272,7 +272,6 @@ def _movement(model: RobotModel, i: int) -> tuple[str, list[float]]:
 
 
 def _skeleton(model: RobotModel, joint: int) -> Iterator[dict[str, Any]]:
-    """Return the drum of a joint and the links to its children."""
     radius = _THICKNESS * _reach(model)
     skin = _LINK if joint else _BASE
     for end in _ends(model, joint):
