@@ -8,8 +8,7 @@ import numpy as np
 
 from robotid.base.typing import Array
 from robotid.base.versions import __version__
-from robotid.output.pages.charts import Chart, Series, chart_html
-from robotid.output.pages.html import block, listing, number, page, text
+from robotid.output.pages.html import Chart, Series, block, chart_html, listing, number, page, text
 from robotid.paper.study import CASES, DURATION, PROGRAM, EnergyDrift, ModelStudy
 
 _SHOWN = (1, 2, 5, 20, 100)  # iterations drawn in figure 4

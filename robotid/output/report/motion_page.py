@@ -13,8 +13,18 @@ from robotid.base.typing import Array
 from robotid.base.versions import __version__
 from robotid.design.limits import LIMITS, Course
 from robotid.design.previews import Preview
-from robotid.output.pages.charts import TONES, Chart, Series, chart_html
-from robotid.output.pages.html import Section, block, facts_html, listing, page, paragraphs
+from robotid.output.pages.html import (
+    TONES,
+    Chart,
+    Section,
+    Series,
+    block,
+    chart_html,
+    facts_html,
+    listing,
+    page,
+    paragraphs,
+)
 from robotid.robot.model import RobotModel
 
 _UNITS = ("rad", "rad/s", "rad/s²", "rad/s³", "N m", "W")

@@ -19,7 +19,7 @@ from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.fitted import friction_curve
 from robotid.estimation.fitting.standard_errors import QUANTILE, TorqueBand
 from robotid.identification.result import TorqueIdentification
-from robotid.output.pages.charts import Chart, Plot, Series, broken
+from robotid.output.pages.html import Chart, Plot, Series, broken
 
 _DWARFED = 4.0  # times the height of the measured torque above which the URDF's is hidden
 _PIXELS = 500  # spans closer than one of these pixels are merged

@@ -18,8 +18,8 @@ from robotid.diagnosis.verdict.evidence import uses_line
 from robotid.estimation.fitting.evaluation import Evaluated
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.identification.summary import verdict_cell
-from robotid.output.pages.charts import POINTS
 from robotid.output.pages.html import (
+    POINTS,
     Section,
     block,
     code,
@@ -79,16 +79,16 @@ def write_report(
 ) -> Path:
     """Write the report of an identification as one HTML file, with links to files by their kind."""
     at, links = origin or Origin(), files or {}
-    if isinstance(found, TorqueIdentification):
-        from robotid.output.report.torque_report import torque_report
+    from robotid.output.report.report_content import position_report, torque_report
 
-        report = torque_report(found, at, links.get("replay", ""))
+    replay = links.get("replay", "")
+    if isinstance(found, TorqueIdentification):
+        report = torque_report(found, at, replay)
     else:  # modules of the simulation are imported here
         from robotid.identification.closed_loop.loop_result import PositionIdentification
-        from robotid.output.report.position_page import position_report
 
         assert isinstance(found, PositionIdentification)
-        report = position_report(found, at, links.get("replay", ""))
+        report = position_report(found, at, replay)
     return write_text(_page(found, report, at, links), target)
 
 

@@ -10,8 +10,8 @@ from helpers.pages import bars
 from robotid.diagnosis.verdict.evidence import GOOD, POOR
 from robotid.output.report.errors import worst_errors
 from robotid.output.report.next_steps import Origin, next_steps
+from robotid.output.report.report_content import torque_report
 from robotid.output.report.report_page import first_screen
-from robotid.output.report.torque_report import torque_report
 
 ORIGIN = Origin(("arm.toml",), "out")
 

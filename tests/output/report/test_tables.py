@@ -10,7 +10,7 @@ from helpers.pages import number, percent, tables
 
 from robotid.identification.summary import verdict_cell
 from robotid.output.report.next_steps import Origin
-from robotid.output.report.torque_report import torque_report
+from robotid.output.report.report_content import torque_report
 
 
 @pytest.fixture(scope="module")

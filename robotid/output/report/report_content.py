@@ -1,12 +1,15 @@
-"""The report on an identification from torques: its sections, and the content of its page."""
+"""The content of a report: on an identification from torques, and on one by simulation."""
 
 from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
+from statistics import geometric_mean
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robotid.base.findings import listed
+from robotid.base.typing import Array
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.residual.decisions import DEPENDENCE_SHARE
 from robotid.diagnosis.residual.torque_split import JointTorque, friction_split
@@ -14,14 +17,37 @@ from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.estimation.fitting.drive_terms import DriveChoice
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.fitted import next_errors
+from robotid.identification.closed_loop.position_errors import (
+    DRIFTS,
+    PositionEvaluation,
+    pool_positions,
+)
 from robotid.identification.result import TorqueIdentification
 from robotid.identification.summary import left_out_lines
-from robotid.output.pages.charts import Chart, chart_html
-from robotid.output.pages.html import Cell, block, cell, code, folded, listing, percent, table, text
+from robotid.output.files.entries import loop_parameters
+from robotid.output.pages.html import (
+    Cell,
+    Chart,
+    Series,
+    block,
+    cell,
+    chart_html,
+    code,
+    folded,
+    listing,
+    number,
+    paragraphs,
+    percent,
+    table,
+    text,
+)
 from robotid.output.report import pictures, tables
-from robotid.output.report.errors import TORQUE, VISIBLE, errors_of, worst_errors
+from robotid.output.report.errors import POSITION, TORQUE, VISIBLE, Errors, errors_of, worst_errors
 from robotid.output.report.next_steps import Origin
 from robotid.output.report.report_page import Report, Residual, curves_section, drawn
+
+if TYPE_CHECKING:
+    from robotid.identification.closed_loop.loop_result import PositionIdentification
 
 _TRIED = (
     ("terms", "text", "terms"), ("held-out error %", ".2f", "error"), ("p-value", ".1e", "p_value"),
@@ -40,8 +66,8 @@ def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "")
         title=f"{found.model.name}: identified parameters",
         quantity=TORQUE,
         counted=counted,
-        facts=_facts(found),
-        made=f"<p>{escape(_method(found))}</p>\n",
+        facts=_torque_facts(found),
+        made=f"<p>{escape(_torque_method(found))}</p>\n",
         errors=(block("report.torque_errors"), ""),
         curves=("Torques", _torques(found, worst[0], origin, replay)),
         friction=_friction(found, worst),
@@ -74,7 +100,7 @@ def _names(evaluations: Sequence[Evaluation]) -> str:
     return ", ".join(e.name for e in evaluations)
 
 
-def _facts(found: TorqueIdentification) -> dict[str, str]:
+def _torque_facts(found: TorqueIdentification) -> dict[str, str]:
     before, after, _ = found.scale_check.masses
     is_assumed = found.scale_check.assumed > 0
     is_compared = before > 0 and not is_assumed
@@ -91,7 +117,7 @@ def _facts(found: TorqueIdentification) -> dict[str, str]:
     }
 
 
-def _method(found: TorqueIdentification) -> str:
+def _torque_method(found: TorqueIdentification) -> str:
     fitted, validation = found.fitted, found.validation
     samples = sum(e.recording.extent.smooth for e in fitted)
     rows = sum(e.recording.extent.rows_used for e in fitted)
@@ -127,7 +153,7 @@ def _torques(found: TorqueIdentification, worst: str, origin: Origin, replay: st
     intro = _intro(found, drawn(evaluations, model.row_names))
 
     def charts(e: Evaluation, row: int, link: str, points: int) -> str:
-        return _charts(found, e, row, link, points)
+        return _torque_charts(found, e, row, link, points)
 
     def residuals(row: int) -> Iterator[Residual]:
         return _residuals(() if model.is_static else evaluations, row)
@@ -156,7 +182,9 @@ def _intro(found: TorqueIdentification, shown: Sequence[Evaluation]) -> str:
     return html
 
 
-def _charts(found: TorqueIdentification, e: Evaluation, row: int, link: str, points: int) -> str:
+def _torque_charts(
+    found: TorqueIdentification, e: Evaluation, row: int, link: str, points: int
+) -> str:
     band = found.band(e)
     name, unit = found.model.row_names[row], found.model.row_units[row]
     measured, recording = e.metrics["estimate"].per_joint.get(name), e.recording
@@ -288,3 +316,137 @@ def _parts(torque: JointTorque) -> str:
         rows.append([cell(name, "text"), cell(rms[name], ".3g"), percent(share), details])
     headers = ["component", f"RMS {torque.unit}", "% of torque", "terms, RMS"]
     return table(f"{torque.joint}: torque components, which may cancel", headers, rows)
+
+
+# ---- results that predict positions --------------------------------------------------------
+
+
+def position_report(found: "PositionIdentification", origin: Origin, replay: str = "") -> Report:
+    """Return the content of a report on an identification that predicts positions."""
+    is_driven, validation = found.loop.kind == "torque", found.validation
+    runs = validation or found.fitted
+    together = runs[0].name if len(runs) == 1 else f"{len(runs)} logs together"
+    moving = pool_positions(runs, moving=True).to_dict()["per_joint"]
+    counted = [Errors(together, moving, is_fitted=not validation)]
+    entries = [x for part in parameter_entries(found) for x in part] + loop_parameters(found)
+    source, kind = ("torque-driven simulation", "driven") if is_driven else ("commands", "position")
+    rate = "none" if found.loop.rate is None else f"{found.loop.rate}"
+    controller = {"kind": found.loop.kind, "rate": rate}
+    worst = next(iter(worst_errors(counted)))
+    return Report(
+        title=f"{found.model.name}: drives from {source}",
+        quantity=POSITION,
+        counted=counted,
+        facts=_position_facts(found),
+        made=f"<p>{escape(_position_method(found))}</p>\n",
+        errors=(block(f"report.{kind}_errors", drift=f"{DRIFTS:g}"), _horizons(runs)),
+        curves=("Positions", _positions(found, worst, kind, origin, replay)),
+        parameters=tables.parameter_section(entries, block(f"report.{kind}_parameters")),
+        entries=entries,
+        variation=tables.variation_section(found.variation, {}),
+        appendix={
+            "open": ("Parameters not identifiable", _open_section(found)),
+            "settings": ("Controller", tables.pairs_table("Controller", controller)),
+            **tables.sources_of(found),
+        },
+    )
+
+
+def _unit(run: PositionEvaluation) -> str:
+    """Return the unit of the errors, "mrad or mm" if some joints are prismatic."""
+    return " or ".join(f"{POSITION.prefix}{unit}" for unit in dict.fromkeys(run.units))
+
+
+def _mean(errors: Array | None) -> float | None:
+    """Return the geometric mean of the joints' errors; None if there is none."""
+    return None if errors is None or not (errors > 0).all() else geometric_mean(errors)
+
+
+def _position_facts(found: "PositionIdentification") -> dict[str, str]:
+    run = (found.validation or found.fitted)[0]
+    kind, ours = "not fitted" if found.validation else "fitted", _mean(run.rmse)
+    over = f" over {DRIFTS:g} s" if run.is_driven else ""
+    error = number(None if ours is None else ours / POSITION.scale, ".3g").html
+    return {
+        f"Simulated position error{over}, {kind}": f"<strong>{error} {_unit(run)}</strong>, "
+        f"geometric mean of {len(run.rmse)} joint{'s' * (len(run.rmse) > 1)}"
+    }
+
+
+def _position_method(found: "PositionIdentification") -> str:
+    fitted, validation = ([e.name for e in part] for part in (found.fitted, found.validation))
+    return (
+        f"{len(found.estimate.theta)} parameters of {len(found.model.joints)} joints were fitted "
+        f"to {listed(fitted)} by {found.estimator.name}. "
+        + (f"Validation: {listed(validation)}." if validation else "There is no validation log.")
+    )
+
+
+def _horizons(runs: Sequence[PositionEvaluation]) -> str:
+    """Return errors over the horizon of the simulation: tables."""
+    joints, parts = runs[0].log.joints, list[str]()
+    for run in runs:
+        whole = {} if run.is_driven else {run.extent.end - run.extent.start: run.rmse}
+        errors = {h: x / POSITION.scale for h, x in sorted((dict(run.horizons) | whole).items())}
+        rows = [
+            [code(joint), *(number(float(x[j]), "#.3g") for x in errors.values())]
+            for j, joint in enumerate(joints)
+        ]
+        foot = [text("geometric mean"), *(number(_mean(x), "#.3g") for x in errors.values())]
+        caption = f"{run.name}: error over the horizon, {_unit(run)}"
+        heads = ["joint", *(f"{h:.4g} s" for h in errors)]
+        parts.append(table(caption, heads, rows, foot, is_data=True))
+    return "".join(parts)
+
+
+def _positions(
+    found: "PositionIdentification", worst: str, kind: str, origin: Origin, replay: str
+) -> str:
+    intro = block(f"report.{kind}s", drift=f"{DRIFTS:g}")
+
+    def charts(run: PositionEvaluation, row: int, link: str, points: int) -> str:
+        kind = "not fitted" if run in found.validation else "fitted"
+        return _position_charts(run, kind, row, link, points)
+
+    def residuals(row: int) -> Iterator[Residual]:
+        for e in found.validation or found.fitted:
+            yield Residual(e.name, e.log.name, e.log.t, (e.log.q - e.q)[:, row])
+
+    runs = (*found.validation, *found.fitted)
+    return curves_section(
+        found, runs, worst, (replay, origin), intro, charts, residuals, POSITION, runs[0].units
+    )
+
+
+def _position_charts(run: PositionEvaluation, kind: str, j: int, link: str, points: int) -> str:
+    log, joint, unit = run.log, run.log.joints[j], run.units[j]
+    q, q_sim = log.q[:, j], run.q[:, j]
+    positions = [Series("measured", q, "text"), Series("simulated", q_sim, "predicted")]
+    left = [Series("measured − simulated", (q - q_sim) / POSITION.scale, "residual")]
+    if log.q_ref is not None and not run.is_driven:
+        positions.insert(0, Series("commanded", log.q_ref[:, j], "tone-5"))
+        far = (q - log.q_ref[:, j]) / POSITION.scale
+        left.insert(0, Series("measured − commanded", far, "tone-5", is_hidden=True))
+    above = Chart(
+        f"position of {joint}", log.t, tuple(positions), "time [s]", f"position [{unit}]", link=link
+    )
+    below = Chart(
+        f"position error of {joint}", log.t, tuple(left), "time [s]", f"error [m{unit}]",
+        link=link, height=110,
+    )  # fmt: skip
+    caption = f"{escape(run.name)}, {kind}: RMSE {run.rmse[j] / POSITION.scale:.3g} m{unit}"
+    return chart_html(above, caption, points=points) + chart_html(below, "", points=points)
+
+
+def _open_section(found: "PositionIdentification") -> str:
+    words = ["The logs determine all free parameters."]
+    if found.undetermined:
+        words = [f"The logs do not determine {listed(found.undetermined)}."]
+    words += [f"Indistinguishable: {listed(names)}." for names in found.correlated]
+    if found.is_scaled_by_gain:
+        words.append(
+            "Positions and commands determine torques up to a common factor: gains, inertias, "
+            "friction and masses multiplied by this factor cause the same motion. Stated "
+            "parameters and the masses of the URDF determine the factor."
+        )
+    return paragraphs(words)
