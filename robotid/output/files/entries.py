@@ -32,9 +32,7 @@ _EXTENT = ("samples", "rate", "start", "end", "rows_used", "segments")
 
 
 def build_result(
-    found: Identification,
-    settings: Mapping[str, Any],
-    outputs: Mapping[str, str] | None = None,
+    found: Identification, settings: Mapping[str, Any], outputs: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
     """Return the content of result.json: plain values, all numbers finite."""
     model, (bodies, drives) = found.model, parameter_entries(found)

@@ -184,10 +184,7 @@ def _is_readable(mesh: Path) -> bool:
 
 
 def _mjcf(
-    model: RobotModel,
-    servos: _Servos,
-    links: Sequence[SimulatedLink],
-    values: Mapping[str, float],
+    model: RobotModel, servos: _Servos, links: Sequence[SimulatedLink], values: Mapping[str, float]
 ) -> ET.Element:
     top = ET.Element("mujoco", model=model.name)
     ET.SubElement(top, "compiler", _COMPILER)

@@ -57,11 +57,7 @@ FORMAT = Format(
 
 
 def export(
-    result: Result,
-    target: Path,
-    *,
-    samples: int | None = None,
-    seed: int | None = None,
+    result: Result, target: Path, *, samples: int | None = None, seed: int | None = None
 ) -> Written:
     """Write the ranges that a result states, as YAML, and samples beside it, as JSON."""
     if samples is None and seed is not None:
