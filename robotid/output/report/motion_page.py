@@ -42,12 +42,6 @@ _UNCHECKED = {
 _NAMED = 5  # base parameters with the largest expected standard errors that are named
 _SHARP = 0.1  # share of the plausible range below which one is well determined ...
 _OPEN = 0.5  # ... and above which it is undetermined
-_SOURCES = {
-    "data": "by the motion",
-    "mixed": "by motion and URDF together",
-    "prior": "by the URDF alone",
-    "bound": "by the bounds of physical consistency",
-}
 
 
 def write_motion_page(
@@ -167,15 +161,12 @@ def _expected(preview: Preview) -> str:
     least = [
         f"{found.mapping.base_names[k]} {100 * ratio[k]:.0f} %" for k in order if ratio[k] > _OPEN
     ]
-    counts = {source: found.sources.count(source) for source in dict.fromkeys(found.sources)}
-    sources = [f"{count} {_SOURCES[source]}" for source, count in counts.items()]
     stds = [f"{joint} {s:.2g}" for joint, s in zip(found.model.joints, noise.std, strict=True)]
     sentences = [
         f"{preview.words}.",
         f"Of {len(ratio)} base parameters, {int((ratio < _SHARP).sum())} have an expected standard "
         f"error below 10 % of their plausible range, {int((ratio > _OPEN).sum())} above 50 %.",
         f"Largest, in % of the plausible range: {', '.join(least)}." if least else "",
-        f"The standard parameters will be determined: {listed(sources)}.",
         f"Standard deviation of the torque noise, {listed(dict.fromkeys(noise.origins))}: "
         f"{', '.join(stds)} (N m or N).",
     ]

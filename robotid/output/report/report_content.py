@@ -14,7 +14,6 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.residual.decisions import DEPENDENCE_SHARE
 from robotid.diagnosis.residual.torque_split import JointTorque, friction_split
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
-from robotid.estimation.fitting.drive_terms import DriveChoice
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.fitted import next_errors
 from robotid.identification.closed_loop.position_errors import (
@@ -49,9 +48,8 @@ from robotid.output.report.report_page import Report, Residual, curves_section, 
 if TYPE_CHECKING:
     from robotid.identification.closed_loop.loop_result import PositionIdentification
 
-_TRIED = (
-    ("terms", "text", "terms"), ("held-out error %", ".2f", "error"), ("p-value", ".1e", "p_value"),
-    ("", "text", "selected"),
+_SELECTED = (
+    ("joint", "code", "joint"), ("terms", "text", "terms"), ("shape parameters", "text", "shapes"),
 )  # fmt: skip
 
 
@@ -79,11 +77,10 @@ def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "")
         ),
         entries=entries,
         appendix={
-            "drives": ("Selection of friction terms", _drive_choices(found)),
+            "drives": ("Selected friction terms", _selected_terms(found)),
             "base": ("Base parameters", tables.base_table(found)),
             "consistency": ("Physical consistency", tables.consistency_section(found)),
             "open": ("Parameters not identifiable", tables.open_section(found)),
-            "settings": ("Settings", tables.settings_tables(found)),
             **tables.sources_of(found),
         },
     )
@@ -227,31 +224,19 @@ def _friction(found: TorqueIdentification, worst: Sequence[str]) -> str:
     return block("report.friction", log=name, figures=shown, more=more)
 
 
-def _drive_choices(found: TorqueIdentification) -> str:
-    """Return the selection of friction terms of each joint; "" if there is none."""
-    choices = "".join(_choice(drive) for drive in found.drives)
-    return block("report.terms", choices=choices) if choices else ""
-
-
-def _choice(drive: DriveChoice) -> str:
-    selected = " + ".join(drive.families) or "no additional term"
-    shapes = [
-        f"{shape.name} = {shape.value:.3g} ± {shape.std_error:.2g} {shape.unit}"
-        + (" (at its bound)" if shape.is_at_bound else "")
-        for shape in drive.shapes
-    ]
-    title = f"{drive.joint}: {selected}" + (f"; {listed(shapes)}" if shapes else "")
-    rows = [
-        {
-            "terms": " + ".join(tried.families) or "viscous and Coulomb",
-            "error": tried.held_out_error_pct,
-            "p_value": tried.p_value if tried.families else text(""),
-            "selected": "selected" if tried.is_selected else "",
-        }
-        for tried in drive.tried
-    ]
-    tried_terms = listing(title, _TRIED, rows)
-    return f"<details><summary>{escape(title)}</summary>{tried_terms}</details>\n"
+def _selected_terms(found: TorqueIdentification) -> str:
+    """Return the friction terms selected for each joint, with their shape parameters."""
+    rows = []
+    for drive in found.drives:
+        shapes = [
+            f"{shape.name} = {shape.value:.3g} ± {shape.std_error:.2g} {shape.unit}"
+            + (" (at its bound)" if shape.is_at_bound else "")
+            for shape in drive.shapes
+        ]
+        terms = " + ".join(drive.families) or "none"
+        rows.append({"joint": drive.joint, "terms": terms, "shapes": ", ".join(shapes)})
+    selected = listing("Friction terms in addition to viscous and Coulomb", _SELECTED, rows)
+    return block("report.terms") + selected if rows else ""
 
 
 def why_section(found: TorqueIdentification) -> str:
@@ -330,8 +315,6 @@ def position_report(found: "PositionIdentification", origin: Origin, replay: str
     counted = [Errors(together, moving, is_fitted=not validation)]
     entries = [x for part in parameter_entries(found) for x in part] + loop_parameters(found)
     source, kind = ("torque-driven simulation", "driven") if is_driven else ("commands", "position")
-    rate = "none" if found.loop.rate is None else f"{found.loop.rate}"
-    controller = {"kind": found.loop.kind, "rate": rate}
     worst = next(iter(worst_errors(counted)))
     return Report(
         title=f"{found.model.name}: drives from {source}",
@@ -346,7 +329,6 @@ def position_report(found: "PositionIdentification", origin: Origin, replay: str
         variation=tables.variation_section(found.variation, {}),
         appendix={
             "open": ("Parameters not identifiable", _open_section(found)),
-            "settings": ("Controller", tables.pairs_table("Controller", controller)),
             **tables.sources_of(found),
         },
     )

@@ -57,11 +57,6 @@ _BASE = (
     ("parameter", "code", "name"), ("value", ".4g", "value"), ("± error", ".4g", "error"),
     ("relative %", "%", "relative"), ("unit", "text", "unit"), ("expression", "code", "expression"),
 )  # fmt: skip
-_SIGNALS = (
-    ("log", "code", "name"), ("filter", "text", "filter"), ("rate Hz", ".6g", "rate"),
-    ("velocity", "text", "velocity"), ("trim s", ".3g", "trim"),
-    ("minimum speed", ".3g", "min_velocity"), ("gap s", ".3g", "max_gap"),
-)  # fmt: skip
 _INPUTS = (
     ("role", "text", "role"), ("file", "code", "path"), ("samples", "d", "samples"),
     ("rate Hz", ".5g", "rate"), ("from s", ".6g", "start"), ("to s", ".6g", "end"),
@@ -255,38 +250,6 @@ def _codes(names: Iterable[str], between: str = ", ") -> str:
     return between.join(code(name).html for name in names) or "none"
 
 
-def settings_tables(identification: TorqueIdentification) -> str:
-    """Return the tables of the settings, as used."""
-    model, estimate = identification.model, identification.estimate
-    settings = identification.estimator.to_dict()
-    pairs = {
-        "estimator": settings.pop("name"),
-        **{key.replace("_", " "): str(value) for key, value in settings.items()},
-        "solver": f"{estimate.message} ({estimate.n_iter} iterations)",
-        "drive terms": listed(model.layout.terms),
-        "gravity [m/s²]": listed(f"{g:g}" for g in model.pin_model.gravity.linear.tolist()),
-        "base": "floating" if model.free_flyer else "fixed",
-        "joints": listed(model.joints),
-        "locked joints": listed(f"{k} = {v:g}" for k, v in model.locked.items()),
-    }
-    for coupling in model.layout.couplings:
-        ratios = listed(f"{joint} × {ratio:g}" for joint, ratio in coupling.ratios)
-        pairs[f"coupling {coupling.name}"] = ratios
-    signals = []
-    for evaluation in (*identification.fitted, *identification.validation):
-        own = evaluation.recording.signals
-        cutoff = "none" if own.cutoff is None else f"{own.cutoff:g} Hz, order {own.order}"
-        signals.append({**vars(own), "name": evaluation.recording.name, "filter": cutoff})
-    title = "Signals, as used for each log; minimum speed in rad/s or m/s"
-    return pairs_table("Model and estimator", pairs) + listing(title, _SIGNALS, signals)
-
-
-def pairs_table(caption: str, pairs: Mapping[str, str], heads: Sequence[str] = ()) -> str:
-    """Return a table of names and their values."""
-    rows = [[text(key), text(value)] for key, value in pairs.items()]
-    return table(caption, heads or ["setting", "value"], rows)
-
-
 def sources_of(found: Identification) -> dict[str, tuple[str, str]]:
     """Return the parts of an appendix on the files read and the versions that ran."""
     rows = [
@@ -297,10 +260,10 @@ def sources_of(found: Identification) -> dict[str, tuple[str, str]]:
         }
         for entry in input_entries(found)
     ]
-    ran = pairs_table("Versions that ran", versions(), ["what", "version"])
+    ran = [[text(name), text(version)] for name, version in versions().items()]
     return {
         "inputs": ("Inputs", listing("Files read", _INPUTS, rows)),
-        "versions": ("Versions", ran),
+        "versions": ("Versions", table("Versions that ran", ["what", "version"], ran)),
     }
 
 
