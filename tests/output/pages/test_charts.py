@@ -5,14 +5,7 @@ import pytest
 from helpers.browsing import until, visit
 from helpers.pages import charts
 
-from robotid.output.pages.html import (
-    Chart,
-    Series,
-    broken,
-    chart_html,
-    page,
-    thin,
-)
+from robotid.output.pages.html import Chart, Series, broken, chart_html, page, thin
 
 T = 1000.0 + np.arange(5000) / 500  # [s], the log's own time
 

@@ -21,9 +21,7 @@ from robotid.diagnosis.residual.misfit import (
     setting_of,
 )
 from robotid.diagnosis.verdict.verdict import JointVerdict, Verdict
-from robotid.estimation.fitting.drive_terms import (
-    JointMotion,
-)
+from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.output.report.next_steps import Origin, Step, _once, next_steps
 from robotid.robot.examples import example_urdf
@@ -223,12 +221,7 @@ def test_an_error_comes_before_a_warning_and_three_steps_are_enough(identified):
 @pytest.mark.parametrize(
     ("code", "evidence", "table", "flags"),
     [
-        (
-            "current_for_torque",
-            {},
-            "[torque.gains]\nelbow_joint = GAIN",
-            "--gain elbow_joint=GAIN",
-        ),
+        ("current_for_torque", {}, "[torque.gains]\nelbow_joint = GAIN", "--gain elbow_joint=GAIN"),
         (
             "torque_delay",
             {"delay": 0.0051},

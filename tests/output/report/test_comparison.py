@@ -8,7 +8,6 @@ from html import unescape
 
 import numpy as np
 import pytest
-from helpers.browsing import until, visit
 from helpers.pages import number, percent, tables
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
@@ -188,21 +187,3 @@ def test_results_and_logs_of_one_name_are_told_apart_by_the_shortest_path(folder
     for label, name in zip("ABC", ("monday/out", "tuesday/out", "wls"), strict=True):
         assert f"<p>{label} {name}: <strong>" in html
     assert [x["name"] for x in compare_results(places[:2])["results"]] == ["monday", "tuesday"]
-
-
-def test_the_page_in_the_browser(folder, tmp_path, browser):
-    write_comparison([folder / "a.json", folder / "b.json"], tmp_path / "c.html")
-    with visit(browser, tmp_path / "c.html", color_scheme="dark") as seen:
-        for width in (1280, 360):
-            seen.page.set_viewport_size({"width": width, "height": 800})
-            until(seen, f"document.documentElement.scrollWidth <= {width}")
-        head = seen.page.get_by_role("button", name="(B − A) / s")
-        head.click()
-        head.click()
-        column = 'tr => parseFloat(tr.cells[1].textContent.replace("−", "-"))'
-        shown = seen.page.evaluate(
-            f'[...document.querySelectorAll("table.data tbody tr")].map({column})'
-        )
-        assert shown == sorted(shown, reverse=shown[0] > shown[-1])
-        assert not seen.errors
-        assert not seen.requests

@@ -40,10 +40,7 @@ def pages(tmp_path_factory):
 
 
 # each width and each scheme of each page, though not all four of both: axe takes a second and more
-VIEWS = {
-    "report": ((1280, "light"), (360, "dark")),
-    "compare": ((1280, "dark"), (360, "light")),
-}
+VIEWS = {"report": ((1280, "light"), (360, "dark")), "compare": ((1280, "dark"), (360, "light"))}
 
 
 @pytest.mark.parametrize("name", VIEWS)
