@@ -121,33 +121,20 @@ def torque_charts(
     )
     spans = unused_spans(t, np.isfinite(model))
     kind = "force" if unit == "N" else "torque"
-    torque = Chart(
-        f"{kind.capitalize()} of {name} over time: measured, identified, URDF",
-        t,
-        (
-            Series("URDF", urdf, "urdf", is_weak=True, is_hidden=_dwarfs(urdf, tau, model)),
-            Series("measured", tau, "text", is_weak=True),
-            Series("identified, 95 % band", model, "predicted", half=half),
-        ),
-        "time [s]",
-        f"{kind} [{unit}]",
-        link,
-        spans,
+    title = f"{kind.capitalize()} of {name} over time: measured, identified, URDF"
+    lines = (
+        Series("URDF", urdf, "urdf", is_weak=True, is_hidden=_dwarfs(urdf, tau, model)),
+        Series("measured", tau, "text", is_weak=True),
+        Series("identified, 95 % band", model, "predicted", half=half),
     )
+    torque = Chart(title, t, lines, "time [s]", f"{kind} [{unit}]", link, spans)
+    title = f"Residual of {name} over time, measured minus identified"
     zero = np.where(np.isfinite(model), 0.0, np.nan)
-    residual = Chart(
-        f"Residual of {name} over time, measured minus identified",
-        t,
-        (
-            Series("95 % band", zero, "residual", half=half, is_weak=True),
-            Series("residual", tau - model, "residual"),
-        ),
-        "time [s]",
-        f"residual [{unit}]",
-        link,
-        spans,
-        height=90,
+    below = (
+        Series("95 % band", zero, "residual", half=half, is_weak=True),
+        Series("residual", tau - model, "residual"),
     )
+    residual = Chart(title, t, below, "time [s]", f"residual [{unit}]", link, spans, height=90)
     return torque, residual
 
 
@@ -203,18 +190,14 @@ def friction_chart(
         np.sign(v), v, left[rows, row], friction[rows, row], curve.torque, curve.std
     )
     under = f" at a load of {load:.3g} {unit}" if load else ""
-    return Chart(
-        f"Friction of {joint} against speed, measured and identified",
-        v,
-        (
-            Series("measured", left, "text", "dots", is_weak=True),
-            Series("identified", friction, "predicted", "dots"),
-            Series(f"steady{under}, 95 % band", steady, "residual", half=QUANTILE * std),
-        ),
-        "speed [m/s]" if unit == "N" else "speed [rad/s]",
-        f"friction [{unit}]",
-        height=130,
+    title = f"Friction of {joint} against speed, measured and identified"
+    series = (
+        Series("measured", left, "text", "dots", is_weak=True),
+        Series("identified", friction, "predicted", "dots"),
+        Series(f"steady{under}, 95 % band", steady, "residual", half=QUANTILE * std),
     )
+    speed = "speed [m/s]" if unit == "N" else "speed [rad/s]"
+    return Chart(title, v, series, speed, f"friction [{unit}]", height=130)
 
 
 def why_charts(torque: JointTorque, *, link: str = "time") -> dict[str, Chart]:
@@ -238,16 +221,9 @@ def _split(torque: JointTorque, link: str) -> Chart:
     *stacked, residual, tau = values
     areas = [Series(name, y, _TONES[name], "area") for name, y in zip(parts, stacked, strict=True)]
     lines = [Series("residual", residual, "residual", "area"), Series("measured", tau, "text")]
-    return Chart(
-        f"Torque of {torque.joint} over time, the sum of {', '.join(parts)} and residual",
-        t,
-        (*areas, *lines),
-        "time [s]",
-        f"torque [{torque.unit}]",
-        link,
-        unused_spans(torque.rows.t[k], torque.used[k]),
-        height=240,
-    )
+    title = f"Torque of {torque.joint} over time, the sum of {', '.join(parts)} and residual"
+    spans, unit = unused_spans(torque.rows.t[k], torque.used[k]), f"torque [{torque.unit}]"
+    return Chart(title, t, (*areas, *lines), "time [s]", unit, link, spans, height=240)
 
 
 def _residual(torque: JointTorque, dependence: Dependence, link: str) -> Chart:
@@ -259,20 +235,15 @@ def _residual(torque: JointTorque, dependence: Dependence, link: str) -> Chart:
     mean, error = dependence.at(x[k])
     is_one = name == "time" and len(torque.rows.recordings) == 1
     residual, less = torque.against_time if name == "time" else (torque.residual, "")
-    explained = f" minus its mean over {less}" if less else ""
-    return Chart(
-        title=f"Residual of {torque.joint}{explained} against {name}, with its mean and 95 % "
-        "interval",
-        x=x[k],
-        series=(
-            Series("residual", residual[k], "residual", "dots", is_weak=True),
-            Series("mean", mean, "text", half=QUANTILE * error),
-        ),
-        x_label=f"{name} [{unit}]",
-        y_label=f"residual [{torque.unit}]",
-        link=link if is_one else "",
-        height=120,
+    what = f"Residual of {torque.joint}{f' minus its mean over {less}' if less else ''}"
+    series = (
+        Series("residual", residual[k], "residual", "dots", is_weak=True),
+        Series("mean", mean, "text", half=QUANTILE * error),
     )
+    return Chart(
+        f"{what} against {name}, with its mean and 95 % interval", x[k], series,
+        f"{name} [{unit}]", f"residual [{torque.unit}]", link if is_one else "", height=120,
+    )  # fmt: skip
 
 
 def _first(torque: JointTorque) -> Array:
