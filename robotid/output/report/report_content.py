@@ -1,6 +1,7 @@
 """The content of a report: on an identification from torques, and on one by simulation."""
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from html import escape
 from pathlib import Path
 from statistics import geometric_mean
@@ -41,7 +42,7 @@ from robotid.output.pages.html import (
     text,
 )
 from robotid.output.report import pictures, tables
-from robotid.output.report.errors import POSITION, TORQUE, VISIBLE, Errors, errors_of, worst_errors
+from robotid.output.report.errors import POSITION, TORQUE, Errors, errors_of, worst_errors
 from robotid.output.report.next_steps import Origin
 from robotid.output.report.report_page import Report, Residual, curves_section, drawn
 
@@ -59,7 +60,7 @@ def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "")
     counted = [errors for errors, e in zip(validation, found.validation, strict=True)
                if not e.is_refitted] or [fitted]  # fmt: skip
     entries = [entry for part in parameter_entries(found) for entry in part]
-    worst = [*worst_errors(counted)]
+    worst = next(iter(worst_errors(counted)))
     return Report(
         title=f"{found.model.name}: identified parameters",
         quantity=TORQUE,
@@ -67,8 +68,8 @@ def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "")
         facts=_torque_facts(found),
         made=f"<p>{escape(_torque_method(found))}</p>\n",
         errors=(block("report.torque_errors"), ""),
-        curves=("Torques", _torques(found, worst[0], origin, replay)),
-        friction=_friction(found, worst),
+        curves=("Torques", _torques(found, worst, origin, replay)),
+        friction=_friction(found),
         bodies=tables.body_table(found),
         why=why_section(found),
         variation=tables.variation_section(found.variation, _next_errors(found)),
@@ -148,16 +149,9 @@ def _chain(signals: SignalSettings) -> str:
 def _torques(found: TorqueIdentification, worst: str, origin: Origin, replay: str) -> str:
     evaluations, model = found.validation or found.fitted, found.model
     intro = _intro(found, drawn(evaluations, model.row_names))
-
-    def charts(e: Evaluation, row: int, link: str, points: int) -> str:
-        return _torque_charts(found, e, row, link, points)
-
-    def residuals(row: int) -> Iterator[Residual]:
-        return _residuals(() if model.is_static else evaluations, row)
-
     return curves_section(
-        found, evaluations, worst, (replay, origin), intro, charts, residuals, TORQUE,
-        model.row_units,
+        found, evaluations, worst, (replay, origin), intro, partial(_torque_charts, found),
+        partial(_residuals, () if model.is_static else evaluations), TORQUE, model.row_units,
     )  # fmt: skip
 
 
@@ -199,29 +193,22 @@ def _torque_charts(
     return chart_html(torque, caption, points=points) + chart_html(residual, "", points=points)
 
 
-def _friction(found: TorqueIdentification, worst: Sequence[str]) -> str:
+def _friction(found: TorqueIdentification) -> str:
     model, layout = found.model, found.model.layout
     if model.is_static or all(term.is_inertia for _, term in layout.drive_parameters):
         return ""
     split = friction_split(model, pictures.shown_evaluation(found), found.standard)
-    figures = {}
+    figures = ""
     for joint in model.row_names:
         chart = pictures.friction_chart(found, joint, split=split)
         if chart is None:
             is_driven = joint in model.joints and joint not in model.passive
             why = "no samples used" if is_driven else "no drive"
-            figures[joint] = f"<p>{escape(joint)}: {why}.</p>\n"
+            figures += f"<p>{escape(joint)}: {why}.</p>\n"
         else:
-            figures[joint] = chart_html(chart, f"<strong>{escape(joint)}</strong>")
-    is_few = len(figures) <= VISIBLE
-    first = [joint for joint in figures if is_few or joint in worst[:VISIBLE]]
-    more = "".join(html for joint, html in figures.items() if joint not in first)
-    if more:
-        title = f"{len(figures) - len(first)} more joints with smaller errors"
-        more = folded("friction-more", title, f'<div class="plots small">\n{more}</div>\n')
+            figures += chart_html(chart, f"<strong>{escape(joint)}</strong>")
     name = escape(pictures.shown_evaluation(found).name)
-    shown = "".join(figures[joint] for joint in first)
-    return block("report.friction", log=name, figures=shown, more=more)
+    return block("report.friction", log=name, figures=figures)
 
 
 def _selected_terms(found: TorqueIdentification) -> str:
@@ -385,22 +372,22 @@ def _positions(
     found: "PositionIdentification", worst: str, kind: str, origin: Origin, replay: str
 ) -> str:
     intro = block(f"report.{kind}s", drift=f"{DRIFTS:g}")
-
-    def charts(run: PositionEvaluation, row: int, link: str, points: int) -> str:
-        kind = "not fitted" if run in found.validation else "fitted"
-        return _position_charts(run, kind, row, link, points)
-
-    def residuals(row: int) -> Iterator[Residual]:
-        for e in found.validation or found.fitted:
-            yield Residual(e.name, e.log.name, e.log.t, (e.log.q - e.q)[:, row])
-
-    runs = (*found.validation, *found.fitted)
+    runs, judged = (*found.validation, *found.fitted), found.validation or found.fitted
     return curves_section(
-        found, runs, worst, (replay, origin), intro, charts, residuals, POSITION, runs[0].units
-    )
+        found, runs, worst, (replay, origin), intro, partial(_position_charts, found),
+        partial(_position_errors, judged), POSITION, runs[0].units,
+    )  # fmt: skip
 
 
-def _position_charts(run: PositionEvaluation, kind: str, j: int, link: str, points: int) -> str:
+def _position_errors(runs: Sequence[PositionEvaluation], row: int) -> Iterator[Residual]:
+    for e in runs:
+        yield Residual(e.name, e.log.name, e.log.t, (e.log.q - e.q)[:, row])
+
+
+def _position_charts(
+    found: "PositionIdentification", run: PositionEvaluation, j: int, link: str, points: int
+) -> str:
+    kind = "not fitted" if run in found.validation else "fitted"
     log, joint, unit = run.log, run.log.joints[j], run.units[j]
     q, q_sim = log.q[:, j], run.q[:, j]
     positions = [Series("measured", q, "text"), Series("simulated", q_sim, "predicted")]

@@ -39,9 +39,10 @@ _WIDEST = 7  # logs that a page shows side by side
 _FIRST_TERMS = ("kp", "kd", "delay", "limit", "zero")  # of a drive, before all others
 _MILLI = {"s": "ms"}  # units in the table of drives
 _ROLES = {"urdf": "URDF", "identification": "fitted", "validation": "validation"}
-_CHOSEN = {
-    "cv": "selected by cross-validation on the fitted logs",
-    "evidence": "selected by the evidence of the fitted logs",
+_CONSTRAINTS = {  # in the details of a consistent fit
+    "active": "Active constraints",
+    "relaxed": "Extents that contradict the data",
+    "pinned": "Fixed at the URDF's values",
 }
 #: Units of ``CENTRAL_TERMS``.
 _CENTRAL_UNITS = ("kg", "m", "m", "m", *["kg m²"] * 6)
@@ -185,8 +186,6 @@ def base_table(identification: TorqueIdentification) -> str:
         error = math.inf if name in undetermined else float(identification.base_error[k])
         shown, uncertainty = with_error(value, error)
         relative = 100 * error / abs(value) if value and math.isfinite(error) else None
-        if relative is not None and relative >= 1000:
-            relative = Cell("&gt; 999", "number", relative)
         rows.append(
             {"name": name, "value": shown, "error": uncertainty, "relative": relative,
              "unit": units[mapping.independent[k]], "expression": mapping.expressions[k]}
@@ -196,32 +195,16 @@ def base_table(identification: TorqueIdentification) -> str:
 
 
 def consistency_section(identification: TorqueIdentification) -> str:
-    """Return whether bodies and drives are consistent; prior, bounds, mass matrix."""
-    check, details = identification.mass_matrix, identification.estimate.details
-    layout = identification.model.layout
+    """Return whether bodies and drives are consistent, and the constraints of the fit."""
+    details, layout = identification.estimate.details, identification.model.layout
     lows = np.linalg.eigvalsh(pseudo_inertia(identification.standard[: layout.n_inertial]))[:, 0]
     wrong = [
         f"{body} ({low:.3g})" for body, low in zip(layout.bodies, lows, strict=True) if low <= 0
     ]
-    share = "at all" if check.is_positive else f"at {100 * check.positive_share:.3g} % of"
-    notes = [
-        f"The mass matrix, armatures included, is positive definite {share} {check.poses} random "
-        f"poses (smallest eigenvalue {check.smallest_eigenvalue:.3g})."
-    ]
-    notes += [f"Inconsistent, with the smallest eigenvalue: {listed(wrong)}."] if wrong else []
-    if "prior" in details:
-        prior = details["prior"]
-        chosen = _CHOSEN.get(prior.get("chosen_by", ""), "as set")
-        active = ", ".join(details["active"])
-        notes += [
-            "The prior is the distance from the URDF's values by the divergence of the "
-            f"pseudo-inertias (entropic); its weight is {prior['weight']:.3g}, {chosen}.",
-            f"Active constraints: {active}." if active else "No constraint is active.",
-        ]
-        if details["relaxed"]:
-            notes.append(f"Extents that contradict the data: {', '.join(details['relaxed'])}.")
-        if details["pinned"]:
-            notes.append(f"Fixed at the URDF's values: {', '.join(details['pinned'])}.")
+    notes = [f"Inconsistent, with the smallest eigenvalue: {listed(wrong)}."] if wrong else []
+    for key, words in _CONSTRAINTS.items():
+        if key in details:
+            notes.append(f"{words}: {listed(details[key])}.")
     is_consistent = identification.is_consistent
     every = "All bodies and drives are" if is_consistent else "Not all bodies and drives are"
     return block("report.consistency", all=every, notes=paragraphs(notes))
