@@ -115,10 +115,7 @@ def _left_out(found: TorqueIdentification) -> dict[str, Any]:
 
 
 def _variation(found: TorqueIdentification) -> dict[str, Any]:
-    """Return the variation between three or more logs, with the torque error of the next log.
-
-    Sums over the rows of each log are those to which the next logs are added.
-    """
+    """Return the variation between three or more logs, the next one's torque error, and sums."""
     if found.variation is None or found.sums is None:
         return {}
     rows = zip(found.model.row_names, next_errors(found).tolist(), strict=True)

@@ -141,10 +141,7 @@ class Written:
 def unstated_terms(
     model: RobotModel, pi: Array, name: str, terms: Collection[str], *, has_couplings: bool = False
 ) -> list[str]:
-    """Return a sentence on drive parameters and loops that a format cannot state, if any.
-
-    pi (p,).
-    """
+    """Return a sentence on drive parameters and loops that a format cannot state: pi (p,)."""
     layout = model.layout
     drives = zip(layout.drive_parameters, layout.drive_names, pi[layout.n_inertial :], strict=True)
     missing = [

@@ -75,10 +75,7 @@ def export(
 
 
 def parameter_ranges(found: Identified) -> dict[str, Any]:
-    """Return the ranges of the parameters of links and drives, as plain values.
-
-    The intervals of centre and moments are first-order functions of those of the parameters.
-    """
+    """Return the ranges of links and drives as plain values, to first order in the parameters."""
     layout, sources, quantile = found.model.layout, found.sources, found.standard_quantile
     variation = getattr(found, "variation", None)  # not of a result from commands
     between = {} if variation is None else {x.name: x.prediction for x in variation.parameters}
@@ -217,10 +214,7 @@ def _least(term: str) -> float:
 
 
 def covariance_entry(names: Sequence[str], covariance: Array, is_fixed: Array) -> dict[str, Any]:
-    """Return the covariance of parameters for result.json, as its root.
-
-    covariance (p, p), is_fixed (p,).
-    """
+    """Return a covariance (p, p) for result.json, as its root; fixed parameters (p,) have none."""
     is_known = ~(is_fixed | is_fixed[:, None]) & np.isfinite(covariance)
     L = root_of(np.where(is_known, covariance, 0.0))
     root = [[float(f"{x:.{_DIGITS}g}") for x in np.trim_zeros(row, "b")] for row in L]
@@ -256,14 +250,12 @@ def write_samples(result: Result, target: Path, count: int, seed: int) -> None:
 
 
 def sample(result: Result, count: int, rng: np.random.Generator) -> tuple[list[str], Array]:
-    """Return samples of all parameters from their joint distribution.
+    """Return samples (count, p) of all parameters from their joint distribution.
 
     Bodies are normal with the covariance of the fit, given that all are physically possible.
     Drive parameters with a spread between logs have the predictive distribution of the next log or
     robot. Their correlation is that of the error of the fit, with all its parameters, and that of
     their values in the logs, among each other.
-
-    -> (count, p).
     """
     model, pi = result.identified
     stated = result.content.get("covariance")
@@ -316,10 +308,7 @@ def sample(result: Result, count: int, rng: np.random.Generator) -> tuple[list[s
 
 
 def _positive_definite(J: Array) -> Array:
-    """Return which symmetric matrices, shape (k, n, n), are positive definite, shape (k,).
-
-    They are those whose elimination has positive pivots only.
-    """
+    """Return whether the pivots of symmetric matrices (k, n, n) are positive, shape (k,)."""
     left = np.array(J.transpose(1, 2, 0), order="C")
     found = np.ones(len(J), dtype=bool)
     for k in range(len(left)):

@@ -63,10 +63,7 @@ class CommandedDrive:
 def commanded_drives(
     model: RobotModel, pi: Array, content: Mapping[str, Any], name: str
 ) -> tuple[CommandedDrive, ...]:
-    """Return the drives of a result with gains, in the order of the joints; none without gains.
-
-    pi (p,).
-    """
+    """Return the drives of a result with gains, by joint; none without gains: pi (p,)."""
     stated = {entry["name"]: float(entry["value"]) for entry in content["drive_parameters"]}
     if not any(f"{joint}.kp" in stated for joint in model.joints):
         return ()
@@ -183,10 +180,7 @@ class Result:
         return rate
 
     def follow_commands(self, log: Log) -> Array:
-        """Return the encoder readings simulated on the commands of a log, (N, n) [rad or m].
-
-        The joints of the log are those of the robot in the same order.
-        """
+        """Return the encoder readings simulated on a log's commands, (N, n) [rad or m]."""
         if not self.commanded:
             raise DataError(
                 f"{self.path.name} has no gains of drives, which a simulation on commands requires"

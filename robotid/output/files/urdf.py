@@ -79,8 +79,9 @@ def write_urdf(
         "urdf_sha256": _digest(content),
         "source": {"urdf": source.name, "sha256": _digest(original)},
         **_facts(model, pi, places),
-        **_projected_facts(dynamics),
     }
+    if isinstance(dynamics, Projection) and dynamics.drives:
+        facts["projected_dynamics"] = {drive.name: drive.to_dict() for drive in dynamics.drives}
     with folder_beside(goal.parent) as partial:
         (partial / goal.name).write_bytes(content)
         text = json.dumps(facts, indent=1, allow_nan=False, ensure_ascii=False)
@@ -190,12 +191,6 @@ def _facts(model: RobotModel, pi: Array, places: Sequence[LinkPlace]) -> dict[st
     }
 
 
-def _projected_facts(dynamics: Projection | bool) -> dict[str, Any]:
-    if not isinstance(dynamics, Projection) or not dynamics.drives:
-        return {}
-    return {"projected_dynamics": {drive.name: drive.to_dict() for drive in dynamics.drives}}
-
-
 def _lumped(model: RobotModel, places: Sequence[LinkPlace]) -> dict[str, list[str]]:
     lumped: dict[str, list[str]] = {}
     for place in places:
@@ -235,10 +230,7 @@ def _check_target(source: Path, target: Path) -> None:
 
 
 def link_parameters(model: RobotModel, pi: Array) -> dict[str, Array]:
-    """Return the ten parameters of each moving link in its frame, without locked links.
-
-    pi (p,) -> (10,).
-    """
+    """Return the ten parameters of each moving link in its frame, without locked links: pi (p,)."""
     _check_parameters(model, pi)
     layout = model.layout
     advice = "identify with the estimator 'consistent', whose bodies and drives are possible"

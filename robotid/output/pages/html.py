@@ -185,14 +185,16 @@ def verdict_html(robot: str, status: str, reasons: Sequence[str], uses: str = ""
     items = [f"<li>{escape(reason)}</li>" for reason in reasons]
     more = "".join(items[_FIRST:])
     if more:
-        count = len(items) - _FIRST
-        title = f"{count} more reason{'s' if count > 1 else ''}"
+        title = f"{len(items) - _FIRST} more reason{'s' if len(items) > _FIRST + 1 else ''}"
         more = f"<details><summary>{title}</summary><ul>{more}</ul></details>"
-    uses = f'<p class="uses">{escape(uses)}</p>' if uses else ""
-    return (
-        f'<div class="verdict {status.replace(" ", "-")}"><h1>{escape(robot)} '
-        f"<span>Verdict: <strong>{status}</strong></span></h1>"
-        f"<ul>{''.join(items[:_FIRST])}</ul>{more}{uses}</div>\n"
+    return block(
+        "page.verdict",
+        kind=status.replace(" ", "-"),
+        robot=escape(robot),
+        status=status,
+        first="".join(items[:_FIRST]),
+        more=more,
+        uses=f'<p class="uses">{escape(uses)}</p>' if uses else "",
     )
 
 
@@ -255,7 +257,8 @@ def scaffold(
     if run:
         policy += "; script-src " + " ".join(map(_allowed, run))
     inline = "".join(f"<script>{script}</script>\n" for script in run)
-    page = {"title": escape(title), "head": _toned(head) + style, "body": body + inline}
+    toned = head.replace("/*tones*/", "\n" + asset("tones.css"))
+    page = {"title": escape(title), "head": toned + style, "body": body + inline}
     return block("page.document", policy=policy, **page)
 
 
@@ -263,10 +266,6 @@ def scaffold(
 def _allowed(script: str) -> str:
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
     return f"'sha256-{digest}'"
-
-
-def _toned(head: str) -> str:
-    return head.replace("/*tones*/", "\n" + asset("tones.css"))
 
 
 def _row(cells: Sequence[Cell], *, is_data: bool = False) -> str:
@@ -383,10 +382,7 @@ def chart_html(chart: Chart, caption: str, *, points: int = POINTS) -> str:
 
 
 def thin(y: Array, points: int) -> NDArray[np.int_]:
-    """Return the points of a line that are sufficient to draw it: its extremes and its breaks.
-
-    y (N,).
-    """
+    """Return the points of a line (N,) that are sufficient to draw it: its extremes and breaks."""
     count = len(y)
     if count <= points:
         return np.arange(count)
@@ -405,10 +401,7 @@ def thin(y: Array, points: int) -> NDArray[np.int_]:
 
 
 def broken(segment: Array, x: Array, *lines: Array) -> tuple[Array, ...]:
-    """Return x and lines with a row of NaN between the segments of a recording.
-
-    segment (N,), x (N,), *lines (N,).
-    """
+    """Return x and lines, (N,), with a row of NaN between the segments (N,) of a recording."""
     ends = np.flatnonzero(np.diff(segment)) + 1
     between = (x[ends - 1] + x[ends]) / 2
     return np.insert(x, ends, between), *(np.insert(y, ends, np.nan) for y in lines)

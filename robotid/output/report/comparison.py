@@ -69,7 +69,7 @@ def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
         "fitted_alike": len({_recordings(result, "identification") for result in results}) == 1,
         "notes": notes,
         "base_parameters": _base_parameters(results),
-        "settings": _differences([_flat(_chosen(result)) for result in results]),
+        "settings": _differences([_flat(result["settings"]) for result in results]),
         "inputs": _inputs(results),
         "versions": _differences([r.get("versions", {"robotid": r["robotid"]}) for r in results]),
     }
@@ -89,10 +89,7 @@ def _label(k: int) -> str:
 
 
 def _short_names(paths: Sequence[str | Path]) -> dict[str, str]:
-    """Return the shortest unique end of each path.
-
-    A common end of all paths is left out, as "result.json" of folders a and b.
-    """
+    """Return the shortest unique end of each path, without the end that all have in common."""
     parts = {str(path): Path(path).resolve().parts for path in paths}
     every, common = set(parts.values()), 0
     while len(every) > 1 and len({names[-common - 1 :][:1] for names in every}) == 1:
@@ -242,10 +239,6 @@ def _difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> float | Non
     return (other["value"] - one["value"]) / combined if combined > 0 else None
 
 
-def _chosen(result: Mapping[str, Any]) -> dict[str, Any]:
-    return {k: v for k, v in result["settings"].items() if k not in _FILES}
-
-
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     found: dict[str, str] = {}
     for key, value in values.items():
@@ -266,7 +259,7 @@ def _plain(value: object) -> str:
 
 def _differences(each: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
     """Return the keys whose values differ; "" where a key is missing."""
-    keys = dict.fromkeys(key for values in each for key in values)
+    keys = dict.fromkeys(key for values in each for key in values if key not in _FILES)
     rows = [{"name": key, "values": [values.get(key, "") for values in each]} for key in keys]
     return [row for row in rows if len(set(row["values"])) > 1]
 

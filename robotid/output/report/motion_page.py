@@ -51,10 +51,7 @@ def write_motion_page(
     course: Course,
     expected: Preview,
 ) -> Path:
-    """Write a designed motion's use of the limits and its expected errors, as one HTML file.
-
-    The file loads nothing from the network. It is written under a temporary name, then renamed.
-    """
+    """Write a designed motion's use of the limits and its expected errors, as one HTML file."""
     sections = {
         "limits": Section("Smallest margin to each limit", _limit_table(model, content, course)),
         "time": Section("Course over time", _over_time(model, content, course)),

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 from robotid.base.findings import Cause, grouped, listed, toml_key
 from robotid.base.settings import is_number
@@ -142,10 +142,7 @@ def sentence_of(message: str) -> str:
 
 
 def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
-    """Return the next steps, the most urgent first: three at most.
-
-    Steps for errors come first, then steps for warnings, then uses of the result.
-    """
+    """Return three next steps at most: those for errors, those for warnings, uses of the result."""
     if not isinstance(found, TorqueIdentification):
         return _steps_of_motion(found, origin)
     by_step: dict[str, list[Cause]] = {}
@@ -196,9 +193,6 @@ def _once(steps: Sequence[Step]) -> tuple[Step, ...]:
         blocks = tuple(block for block in step.blocks if block not in later)
         unique.append(replace(step, blocks=blocks))
     return tuple(unique)
-
-
-_Maker: TypeAlias = "Callable[[TorqueIdentification, Origin, Sequence[Cause]], Step]"
 
 
 def _of_verdict(found: TorqueIdentification) -> list[Cause]:
@@ -389,10 +383,7 @@ def _doctor(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]
 
 
 def _uses(found: TorqueIdentification, origin: Origin, asked: Sequence[Step]) -> list[Step]:
-    """Return the uses of a result, without commands that other steps have.
-
-    A poor result is only examined.
-    """
+    """Return the uses of a result, without commands of other steps; a poor one is only examined."""
     steps = [_step("play", origin, _replay(found, origin))]
     if found.verdict.status != "poor":
         validate = origin.using("validate", f"{origin.folder}/result.json", _NEW)
@@ -413,7 +404,7 @@ def _replay(found: Identification, origin: Origin) -> tuple[str, ...]:
 
 
 #: The steps, the most informative first, by the name that the catalogue of findings gives them.
-_STEPS: Mapping[str, _Maker] = {
+_STEPS: Mapping[str, Callable[[TorqueIdentification, Origin, Sequence[Cause]], Step]] = {
     "doctor": _doctor, "scale": _scale, "gains": _gains, "delay": _delay, "locks": _locks,
     "zeros": _zeros, "payload": _payload, "unclipped": _unclipped, "terms": _terms,
     "as_found": _as_found,

@@ -147,10 +147,7 @@ def _dwarfs(y: Array, *others: Array) -> bool:
 
 
 def unused_spans(t: Array, used: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
-    """Return the time spans between used samples; those closer than a pixel are merged.
-
-    t (N,) [s], used (N,).
-    """
+    """Return the time spans between used samples (N,); those closer than a pixel are merged."""
     edges = np.flatnonzero(np.diff(np.r_[True, used, True].astype(int))).reshape(-1, 2)
     pixel = float(t[-1] - t[0]) / _PIXELS if len(t) else 0.0
     spans: list[tuple[float, float]] = []
@@ -201,11 +198,7 @@ def friction_chart(
 
 
 def why_charts(torque: JointTorque, *, link: str = "time") -> dict[str, Chart]:
-    """Return the charts of a joint by name.
-
-    They are "split", the parts of the torque stacked over time, and one for each quantity that the
-    residual may depend on, by its name. Charts over time show the first recording.
-    """
+    """Return the stacked parts of a torque, "split", and its residual against each quantity."""
     charts = {"split": _split(torque, link)}
     for dependence in torque.follows:
         if dependence.name in (*torque.quantities, "time"):

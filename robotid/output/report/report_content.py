@@ -94,10 +94,6 @@ def _next_errors(found: TorqueIdentification) -> dict[str, str]:
     return {row: f"{error:.3g} {unit}" for row, unit, error in rows}
 
 
-def _names(evaluations: Sequence[Evaluation]) -> str:
-    return ", ".join(e.name for e in evaluations)
-
-
 def _torque_facts(found: TorqueIdentification) -> dict[str, str]:
     before, after, _ = found.scale_check.masses
     is_assumed = found.scale_check.assumed > 0
@@ -120,19 +116,16 @@ def _torque_method(found: TorqueIdentification) -> str:
     samples = sum(e.recording.extent.smooth for e in fitted)
     rows = sum(e.recording.extent.rows_used for e in fitted)
     chains = sorted({_chain(e.recording.signals) for e in (*fitted, *validation)})
+    left_out = left_out_lines([metrics.to_dict() for metrics in found.left_out.values()])
+    others = "; ".join(["There is no validation log", *left_out])
+    if validation:
+        others = f"Validation: {listed(e.name for e in validation)}"
     return (
         f"{len(found.base)} base parameters of {len(found.model.joints)} joints were fitted to "
-        f"{_names(fitted)} ({samples} samples after filtering, {rows} torque values used) by "
-        f"{found.estimator.words} ({found.estimator.name}). "
-        + (f"Validation: {_names(validation)}. " if validation else f"{_others(found)}. ")
-        + f"Signals: {'; or '.join(chains)}."
+        f"{listed(e.name for e in fitted)} ({samples} samples after filtering, {rows} torque "
+        f"values used) by {found.estimator.words} ({found.estimator.name}). {others}. Signals: "
+        f"{'; or '.join(chains)}."
     )
-
-
-def _others(found: TorqueIdentification) -> str:
-    """Return that there is no validation log, and the errors of logs left out, as text."""
-    lines = left_out_lines([metrics.to_dict() for metrics in found.left_out.values()])
-    return "There is no validation log" + "".join(f"; {line}" for line in lines)
 
 
 def _chain(signals: SignalSettings) -> str:

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -41,7 +41,6 @@ from robotid.output.report.next_steps import Origin, Step, next_steps
 from robotid.output.report.tables import sources_fact
 
 _ROWS = 24_000  # of all charts over time: about half a MB
-_WORDS = "shows the robot in motion, on the clock of these charts"
 _WINDOW = 1.0  # [s]
 _USED = 0.5  # smallest share of a window's samples that are used
 _FEWEST = 140  # rows of one chart; recordings that would leave fewer are not drawn
@@ -194,11 +193,10 @@ class Clip(NamedTuple):
 class Dock:
     """The replay of a report."""
 
-    replay: str = ""  # file of the replay in the report's folder; "" if it is not written yet
-    # folder of the results, for the command that writes the replay
-    origin: Origin = field(default_factory=Origin)
-    urdf: str = ""
-    clips: Sequence[Clip] = ()  # the recordings with charts
+    replay: str  # file of the replay in the report's folder; "" if it is not written yet
+    origin: Origin  # folder of the results, for the command that writes the replay
+    urdf: str
+    clips: Sequence[Clip]  # the recordings with charts
 
     @property
     def file(self) -> str:
@@ -230,17 +228,12 @@ class Dock:
             clip._asdict() | {"log": Path(clip.log).name, "command": self._command(clip)}
             for clip in self.clips
         ]
-        words, command = f'<a href="{escape(quote(self.replay))}">The replay</a> {_WORDS}.', ""
+        kind, command = "written", ""
         if not self.replay:
-            words = f"The replay {_WORDS}. This command writes it:"
+            kind = "unwritten"
             command = command_html(next(filter(None, map(self._command, self.clips))))
-        return block(
-            "report.dock",
-            file=escape(quote(self.file)),
-            clips=escape(json.dumps(clips)),
-            words=words,
-            command=command and f'<div class="copy">{command}</div>',
-        )
+        file, packed = escape(quote(self.file)), escape(json.dumps(clips))
+        return block(f"report.{kind}_dock", file=file, clips=packed, command=command)
 
 
 class Residual(NamedTuple):

@@ -156,10 +156,7 @@ def sources_fact(entries: Sequence[Mapping[str, Any]]) -> dict[str, str]:
 
 
 def body_table(identification: TorqueIdentification) -> str:
-    """Return mass, centre of mass and inertia about it of each link, below them those of the URDF.
-
-    A value that the data do not determine is the URDF's, and has no interval.
-    """
+    """Return mass, centre and inertia about it of each link, below them those of the URDF."""
     central = central_parameters(identification)
     rows = []
     for i, body in enumerate(identification.model.layout.bodies):

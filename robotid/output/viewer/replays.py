@@ -349,10 +349,7 @@ def _view(model: RobotModel, corners: Sequence[Array], motions: Sequence[Array])
 
 
 def residual_levels(edges: Array, t: Array, residual: Array) -> Array:
-    """Return the RMS residual of each joint in each segment of time.
-
-    edges (B + 1,) [s], t (N,) [s], residual (N, n) -> (B, n).
-    """
+    """Return the RMS (B, n) of residuals (N, n) at t (N,) between edges (B + 1,) of time."""
     bins = len(edges) - 1
     which = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, bins - 1)
     samples = np.bincount(which, minlength=bins)

@@ -41,11 +41,7 @@ class Scene:
 
 
 def robot_scene(model: RobotModel) -> Scene:
-    """Return the nodes and the parts of a robot.
-
-    A body is drawn with the visual shapes of its links if they are found, otherwise as a
-    skeleton: capsules from its joint to the next ones, and a drum along the joint's axis.
-    """
+    """Return nodes and parts: visual shapes of the links, or capsules and drums without any."""
     tree = model.pin_model
     parts, meshes, boxes, missing = _visuals(model)
     notes: tuple[str, ...] = ()
@@ -151,10 +147,7 @@ def _file(model: RobotModel, visual: Shape) -> _File:
 
 @lru_cache(maxsize=4)  # thinning needs seconds, and a robot has many pages
 def _thinned(files: tuple[_File, ...], uses: tuple[int, ...]) -> tuple[list[Surface] | None, ...]:
-    """Return the scaled surfaces of each file, drawn so often, thinned for a page.
-
-    None: not readable.
-    """
+    """Return each file's scaled surfaces, thinned for a page; None if it is not readable."""
     found: list[list[Surface] | None] = []
     for path, scale, _ in files:
         try:
@@ -364,11 +357,7 @@ def _thinned_solid(patches: Sequence[Surface], share: float) -> list[Surface]:
 
 
 def _simplified(V: Array, F: Array, share: float) -> Any:  # noqa: ANN401
-    """Return a share of the triangles of a patch, as a mesh; its rim is kept if it can be.
-
-    Otherwise, too many triangles would remain. The library's error bound assumes coordinates of
-    about 1.
-    """
+    """Return a share of a patch's triangles, for a size of 1; its rim is kept if few remain."""
     import fast_simplification
     import trimesh
 
