@@ -31,7 +31,7 @@ from robotid.dynamics.torque import (
     mass_regressor,
 )
 from robotid.estimation.estimators import PRX, RLS, Kalman, NormalisedGradient, fold
-from robotid.estimation.estimators.descent import column_scale
+from robotid.estimation.estimators.recursive import column_scale
 from robotid.identification.online import OnlineIdentifier
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -40,7 +40,7 @@ from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inerti
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.simulation.truth import another_robot
-from robotid.estimation.estimators.segments import quantile
+from robotid.estimation.estimators.estimator import quantile
 
 CHAINS = {"filtered": SignalSettings(), "raw": SignalSettings(cutoff=None)}
 NOISES = ("white", "unequal", "coloured")

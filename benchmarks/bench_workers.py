@@ -27,7 +27,7 @@ from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import join
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import ReducedPiece
-from robotid.estimation.workers.plan import WorkPlan
+from robotid.estimation.work_plan import WorkPlan
 from robotid.robot.examples import example_urdf
 
 WRITE = Path(bench_memory.__file__)

@@ -18,7 +18,7 @@ from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Noise, Truth
 from robotid.dynamics.simulation.simulator import simulate
 from robotid.dynamics.simulation.truth import draw_parameters
-from robotid.estimation.workers.plan import WorkPlan
+from robotid.estimation.work_plan import WorkPlan
 from robotid.identification.result import TorqueIdentification
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -31,7 +31,7 @@ from robotid.dynamics.factors import available_cores
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.estimation.variation.groups import FEWEST_RUNS
 from robotid.estimation.variation.variation import FALSE_ALARMS, between_units
-from robotid.estimation.workers.plan import Workload, WorkPlan
+from robotid.estimation.work_plan import Workload, WorkPlan
 from robotid.output.files.entries import build_result
 from robotid.output.report.comparison import fleet_page
 

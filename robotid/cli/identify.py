@@ -38,7 +38,7 @@ from robotid.dynamics.friction_projection import project_friction
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings, SimulationSettings
 from robotid.estimation.fitting.evaluation import Evaluated
 from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.workers.plan import WorkPlan
+from robotid.estimation.work_plan import WorkPlan
 from robotid.identification import pipeline
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.pipeline import conclude, robot_of

@@ -14,7 +14,7 @@ from robotid.cli.console import progress_of, show_found
 from robotid.cli.flags import add_json, add_progress, add_verbose
 from robotid.cli.identify import identify_job
 from robotid.cli.job import Job, written_job
-from robotid.estimation.workers.plan import WorkPlan
+from robotid.estimation.work_plan import WorkPlan
 from robotid.identification.result import Identification
 from robotid.output.files.result_file import load_result
 from robotid.output.report.next_steps import Origin

@@ -38,7 +38,7 @@ from robotid.dynamics.used_rows import base_problem, independent_share
 from robotid.estimation.estimators import Estimate
 from robotid.estimation.estimators.batch import solve_factor
 from robotid.estimation.estimators.determination import base_spread, determine
-from robotid.estimation.estimators.segments import FEWEST_SEGMENTS, scatter
+from robotid.estimation.estimators.estimator import FEWEST_SEGMENTS, scatter
 from robotid.estimation.fitting.chosen_estimator import Known, consistent_fit, pinned_links
 from robotid.estimation.fitting.estimator_settings import ConsistentSettings, EstimatorSettings
 from robotid.estimation.fitting.evaluation import evaluate_logs

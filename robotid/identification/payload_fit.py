@@ -18,7 +18,7 @@ from robotid.diagnosis.verdict.scale_check import PayloadCheck
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import join
 from robotid.estimation.estimators import Consistent, Constraints, Estimate
-from robotid.estimation.estimators.segments import quantile
+from robotid.estimation.estimators.estimator import quantile
 from robotid.estimation.estimators.two_runs import Compared, TwoRuns, payload_runs
 from robotid.estimation.fitting.estimator_settings import ConsistentSettings
 from robotid.estimation.fitting.recorded import Recordings

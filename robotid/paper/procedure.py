@@ -1,35 +1,144 @@
-"""The closed-loop procedure: a robot follows a program while its parameters are identified.
+"""The paper's equations, and its procedure: a robot follows a program while it is identified.
 
 One iteration is one run of the program motion. At each of its updates the control (21) is computed
 from the estimate, the plant moves, and the estimate is updated by the deviation (24). R runs are
-computed together, one row each.
+computed together, one row each. In shapes "..." stands for () or (R,). Numbers in parentheses are
+equations of Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.exceptions import DataError, RankDeficientError, SettingsError
 from robotid.base.typing import Array
 from robotid.dynamics.simulation.motions import ProgramMotion
-from robotid.paper.equations import (
-    Bounds,
-    LinearDynamics,
-    Plant,
-    Sign,
-    mass_matrix,
-    one_shot,
-    proximity,
-    recursive_update,
-    reference_acceleration,
-    rk4,
-    smallest_eigenvalue,
-)
 
 _DIVERGED = 1e3  # [rad or m; per s] deviation from the program beyond which a run is stopped
+
+#: Sign of the second term of (23): with minus it is a gradient, plus is printed in the paper.
+Sign: TypeAlias = Literal["corrected", "printed"]
+#: Accelerations of R robots, from their q, v and torques u, each of shape (R, n).
+Plant: TypeAlias = Callable[[Array, Array, Array], Array]
+
+
+@dataclass(frozen=True)
+class LinearDynamics:
+    """A model D(q, P) a + C(q, v, P) = G(q, v, a) P = u that is linear in P, (11)-(13)."""
+
+    names: tuple[str, ...]  # of the c parameters
+    regressor: Callable[[Array, Array, Array], Array]  # G, q, v, a (R, n) -> (R, n, c)
+
+    def torque(self, q: Array, v: Array, a: Array, P: Array) -> Array:
+        """Return u = G(q, v, a) P (13): q, v, a (R, n), P (c,) or (R, c) -> (R, n)."""
+        G = self.regressor(q, v, a)  # (R, n, c)
+        u: Array = np.einsum("rnc,rc->rn", G, np.broadcast_to(P, (len(q), G.shape[-1])))
+        return u
+
+    def mass_matrix(self, q: Array, P: Array) -> Array:
+        """Return D(q, P) from the base parameters alone: q (R, n) -> (R, n, n)."""
+        return self._mass_and_bias(q, np.zeros_like(q), P)[0]
+
+    def acceleration(self, q: Array, v: Array, u: Array, P: Array) -> Array:
+        """Return a = D(q, P)^-1 (u - C(q, v, P)) (11), shape (R, n): not only of rigid bodies."""
+        D, C = self._mass_and_bias(q, v, P)
+        a: Array = np.linalg.solve(D, (u - C)[..., None])[..., 0]
+        return a
+
+    def _mass_and_bias(self, q: Array, v: Array, P: Array) -> tuple[Array, Array]:
+        """Return D(q, P), shape (R, n, n), and C(q, v, P), shape (R, n).
+
+        Column j of D is (G(q, 0, e_j) - G(q, 0, 0)) P: without gravity and constant offsets.
+        """
+        R, n = q.shape
+        unit = np.concatenate([np.eye(n), np.zeros((2, n))])  # accelerations e_1 .. e_n, 0, 0
+        a = np.repeat(unit, R, axis=0)  # ((n + 2) R, n)
+        speeds = np.zeros_like(a)
+        speeds[-R:] = v
+        G = self.regressor(np.tile(q, (n + 2, 1)), speeds, a)
+        parameters = np.broadcast_to(P, (R, G.shape[-1]))
+        u = np.einsum("krnc,rc->krn", G.reshape(n + 2, R, n, -1), parameters)
+        return (u[:n] - u[n]).transpose(1, 2, 0), u[n + 1]
+
+
+def reference_acceleration(
+    q: Array, v: Array, program: tuple[Array, Array, Array], alpha: Array, beta: Array
+) -> Array:
+    """Return q_* = a_pr - alpha (v - v_pr) - beta (q - q_pr) (15), shape (..., n)."""
+    q_pr, v_pr, a_pr = program
+    q_star: Array = a_pr - alpha * (v - v_pr) - beta * (q - q_pr)
+    return q_star
+
+
+def proximity(Psi: Array, P: Array, u: Array, *, sign: Sign = "corrected") -> Array:
+    """Return PRX = Psi^T Psi P - Psi^T u (23), or with a plus, as printed, shape (..., c).
+
+    With the minus it is the gradient (4) of the criterion (3), J = |u - Psi P|^2 / 2, and zero at
+    the true parameters. With the plus it is 2 Psi^T u there. Psi (..., n, c), P (..., c),
+    u (..., n) [N m or N].
+    """
+    if sign not in ("corrected", "printed"):
+        raise SettingsError(f"sign is {sign!r}, wanted 'corrected' or 'printed'")
+    predicted = np.einsum("...nc,...c->...n", Psi, P)
+    residual = predicted - u if sign == "corrected" else predicted + u
+    gradient: Array = np.einsum("...nc,...n->...c", Psi, residual)
+    return gradient
+
+
+def recursive_update(
+    P: Array, Psi: Array, eta: Array, sigma: Array, is_open: Array, *, eps2: float | Array = 1e-12
+) -> Array:
+    """Return P - sigma_D / |Psi|^2 Psi^T eta (24), shape (..., c), with |Psi|^2 = Sp(Psi Psi^T).
+
+    Psi (..., n, c), eta (..., n), sigma (...), is_open (...).
+    """
+    size = np.einsum("...nc,...nc->...", Psi, Psi)
+    moves = is_open & (size > eps2) & (sigma > 0.0)
+    gamma = np.where(moves, sigma, 0.0) / np.where(moves, size, 1.0)
+    updated: Array = P - gamma[..., None] * np.einsum("...nc,...n->...c", Psi, eta)
+    return updated
+
+
+def one_shot(G: Array, G_star: Array, P: Array, names: Sequence[str]) -> Array:
+    """Return the parameters from one recorded motion, P = G^+ G_* P^ (16)-(19), shape (c,).
+
+    The torque is G P, with the measured acceleration, and G_* P^, with the reference acceleration
+    (15) from which it was computed. G (N n, c), G_star (N n, c).
+    """
+    U, s, Vt = np.linalg.svd(G, full_matrices=False)
+    rank = int(np.sum(s > s[0] * 1e-10)) if s[0] > 0 else 0
+    if rank < G.shape[1]:
+        is_open = np.sum(Vt[:rank] ** 2, axis=0) < 0.99
+        raise RankDeficientError(rank, np.array(list(names))[is_open].tolist(), G.shape[1])
+    solved: Array = Vt.T @ ((U.T @ (G_star @ P)) / s)
+    return solved
+
+
+def smallest_eigenvalue(D: Array) -> Array:
+    """Return sigma_D of (24), the smallest eigenvalue of each matrix: D (R, n, n) -> (R,)."""
+    smallest: Array = np.linalg.eigvalsh((D + D.swapaxes(-1, -2)) / 2)[..., 0]
+    return smallest
+
+
+def rk4(
+    acceleration: Callable[[Array, Array], Array],
+    q: Array,
+    v: Array,
+    h: float | Array,
+    a: Array | None = None,
+) -> tuple[Array, Array]:
+    """Return positions and velocities one step later, by the Runge-Kutta method of order 4."""
+    a1 = acceleration(q, v) if a is None else a
+    v2 = v + h / 2 * a1
+    a2 = acceleration(q + h / 2 * v, v2)
+    v3 = v + h / 2 * a2
+    a3 = acceleration(q + h / 2 * v2, v3)
+    v4 = v + h * a3
+    a4 = acceleration(q + h * v3, v4)
+    return q + h / 6 * (v + 2 * v2 + 2 * v3 + v4), v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
 
 
 @dataclass(frozen=True)
@@ -40,7 +149,6 @@ class LoopSettings:
     beta: float | Array = 100.0  # gain of the position in (15) [1/s^2]
     iterations: int = 100  # largest number of runs of the motion
     updates: int = 100  # updates per run; the torque is constant between them (zero-order hold)
-    substeps: int = 1  # Runge-Kutta steps per update; stiff friction needs several
     # ``"recursive"``, (24) at each update, or ``"one_shot"``, (18) after each run
     method: Literal["recursive", "one_shot"] = "recursive"
     sign: Sign = "corrected"  # sign in (23); with the printed one the procedure never stops
@@ -50,10 +158,10 @@ class LoopSettings:
     prx_acceleration: Literal["measured", "reference"] = "measured"
     eps1: float = 1e-9  # if no entry of PRX is larger, it counts as zero [N m / s^2]
     eps2: float | Array = 1e-12  # if |Psi|^2 is not above it, there is no update [1/s^4]
-    bounds: Bounds | None = None  # Omega of (8), or None
+    bounds: tuple[Array, Array] | None = None  # the box Omega of (8): lowest, highest P, (c,) each
 
     def __post_init__(self) -> None:
-        for name in ("alpha", "beta", "eps1", "eps2", "iterations", "updates", "substeps"):
+        for name in ("alpha", "beta", "eps1", "eps2", "iterations", "updates"):
             value = getattr(self, name)
             if not np.all((np.asarray(value) > 0) & (np.asarray(value) < np.inf)):
                 raise SettingsError(f"{name} is {value}, wanted a positive number")
@@ -64,47 +172,52 @@ class LoopSettings:
                 f"prx_acceleration is {self.prx_acceleration!r}, wanted 'measured' or 'reference'"
             )
 
+    def bounded(self, P: Array) -> Array:
+        """Return the nearest parameters within the bounds (8): P (R, c)."""
+        return P if self.bounds is None else np.clip(P, *self.bounds)
+
 
 @dataclass(frozen=True)
 class Influences:
-    """Disturbance of the plant and noise of its sensors.
+    """Disturbance of the plant and noise of its sensors."""
 
-    Attributes:
-        torque: v(t) of (11), from the times, shape (R,), and the control, shape (R, n), to
-            torques, shape (R, n); computed once per update and constant in between. None for none.
-        q, v, a: Standard deviations of white noise on positions [rad or m], velocities and
-            accelerations; each a number or an array that broadcasts to (R, n).
-        rng: Random generator of the noise; required if there is any.
-    """
-
+    # v(t) of (11) from times (R,) and control (R, n), constant between updates; None for none
     torque: Callable[[Array, Array], Array] | None = None
-    q: float | Array = 0.0
-    v: float | Array = 0.0
-    a: float | Array = 0.0
-    rng: np.random.Generator | None = None
+    # standard deviations of white noise, each a number or an array that broadcasts to (R, n)
+    q: float | Array = 0.0  # [rad or m]
+    v: float | Array = 0.0  # [rad/s or m/s]
+    a: float | Array = 0.0  # [rad/s^2 or m/s^2]
+    rng: np.random.Generator | None = None  # of the noise; required if there is any
 
     def __post_init__(self) -> None:
         if self.rng is None and any(np.any(np.asarray(x) != 0) for x in (self.q, self.v, self.a)):
             raise SettingsError("sensor noise is stated, but rng is None, wanted a generator")
+
+    def sensed(self, value: Array, level: float | Array) -> Array:
+        """Return a measured value, with white noise of a standard deviation."""
+        if self.rng is None or not np.any(np.asarray(level) != 0):
+            return value
+        noisy: Array = value + level * self.rng.standard_normal(value.shape)
+        return noisy
 
 
 @dataclass(frozen=True)
 class History:
     """The course of R runs over L iterations."""
 
-    estimates: Array  # P^ before the first iteration and after each, shape (L + 1, R, c)
-    prx: Array  # largest entry of PRX (23) during each iteration, shape (L, R) [N m / s^2]
-    tracking: Array  # largest distance from the program in each iteration, shape (L, R) [rad or m]
-    # the first iteration in which PRX was zero throughout (25), after which the estimate is
-    # constant; 0 if there was none, shape (R,)
+    estimates: Array  # (L + 1, R, c), P^ before the first iteration and after each
+    prx: Array  # (L, R), largest entry of PRX (23) during each iteration [N m / s^2]
+    tracking: Array  # (L, R), largest distance from the program in each iteration [rad or m]
+    # (R,), the first iteration in which PRX was zero throughout (25), after which the estimate is
+    # constant; 0 if there was none
     NA: NDArray[np.int_]
-    # the iteration in which the robot diverged from its program, 0 if it did not, shape (R,). Its
-    # estimate is constant afterwards
+    # (R,), the iteration in which the robot diverged from its program, after which the estimate is
+    # constant; 0 if it did not
     diverged: NDArray[np.int_]
-    # number of updates omitted since D(q, P^) was not positive definite, shape (R,)
-    skipped: NDArray[np.int_]
-    # control u (21), shape (L, updates, R, n) [N m or N], if requested
-    torques: Array | None = field(default=None, repr=False)
+    skipped: NDArray[np.int_]  # (R,), updates omitted since D(q, P^) was not positive definite
+    torques: Array = field(
+        repr=False
+    )  # (L, updates, n), control u (21) of the first run [N m or N]
 
     def relative_error(self, P: Array) -> Array:
         """Return |P^ - P| / |P| before the first iteration and after each: P (c,) -> (L + 1, R)."""
@@ -115,17 +228,8 @@ class History:
 def random_torque(
     share: float | Array, rng: np.random.Generator
 ) -> Callable[[Array, Array], Array]:
-    """Return a disturbance v(t), uniform within a share of the control at every update.
-
-    References:
-        Tzvetkova, (2) and (11).
-    """
-
-    def torque(t: Array, u: Array) -> Array:
-        disturbance: Array = share * u * rng.uniform(-1.0, 1.0, u.shape)
-        return disturbance
-
-    return torque
+    """Return a disturbance v(t) (2), (11), uniform within a share of the control, per update."""
+    return lambda t, u: np.asarray(share * u * rng.uniform(-1.0, 1.0, u.shape))
 
 
 def run_procedure(
@@ -137,34 +241,28 @@ def run_procedure(
     settings: LoopSettings | None = None,
     offset: Array | float = 0.0,
     influences: Influences | None = None,
-    keep_torques: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> History:
-    """Run the closed-loop procedure from initial values.
+    """Run the closed-loop procedure (14)-(25) from initial values P0 (R, c).
 
-    Each iteration starts at rest at the start of the program, or at an offset from it.
-
-    References:
-        Tzvetkova, (14)-(25).
-
-    P0 (R, c), offset (n,).
+    Each iteration starts at rest at the start of the program, or at an offset from it, (n,).
     """
     if P0.ndim != 2 or P0.shape[1] != len(dynamics.names):
         raise DataError(f"P0 has shape {P0.shape}, wanted (R, {len(dynamics.names)})")
-    loop = _Loop(
-        dynamics, plant, motion, settings or LoopSettings(), influences or Influences(), P0, offset
-    )
-    for number in range(1, loop.settings.iterations + 1):
-        loop.iterate(number, keep_torques)
+    chosen = settings or LoopSettings()
+    loop = _Loop(dynamics, plant, motion, chosen, influences or Influences(), P0, offset)
+    for number in range(1, chosen.iterations + 1):
+        loop.iterate(number)
         if progress is not None:
             progress(number)
         if not loop.active.any():
             break
-    return loop.history()
+    estimates, prx, tracking, torques = map(np.stack, loop.courses)
+    return History(estimates, prx, tracking, loop.NA, loop.diverged, loop.skipped, torques)
 
 
 class _Loop:
-    """The state and the history of all runs."""
+    """The state and the course of all runs."""
 
     def __init__(
         self,
@@ -176,93 +274,73 @@ class _Loop:
         P0: Array,
         offset: Array | float,
     ) -> None:
-        R, n = len(P0), dynamics.n_joints
+        R = len(P0)
         self.dynamics, self.plant, self.motion = dynamics, plant, motion
         self.settings, self.influences = settings, influences
-        self.alpha = _column(settings.alpha)
-        self.beta = _column(settings.beta)
+        self.alpha, self.beta = (np.reshape(x, (-1, 1)) for x in (settings.alpha, settings.beta))
         self.dt = np.broadcast_to(np.asarray(motion.duration) / settings.updates, (R,))  # [s]
-        self.start = motion.evaluate(np.zeros(R))[0] + np.broadcast_to(offset, (R, n))
-        self.P = P0 if settings.bounds is None else settings.bounds.project(P0)
+        self.start = motion.evaluate(np.zeros(R))[0] + offset  # (R, n)
+        self.P = settings.bounded(P0)
         self.active = np.ones(R, dtype=bool)
         self.NA, self.diverged, self.skipped = (np.zeros(R, dtype=int) for _ in range(3))
-        self.estimates: list[Array] = [self.P]
-        self.prx: list[Array] = []
-        self.tracking: list[Array] = []
-        self.torques: list[Array] = []
+        #: Estimates, PRX, distances and torques, by iteration.
+        self.courses: tuple[list[Array], ...] = ([self.P], [], [], [])
 
-    def iterate(self, number: int, keep_torques: bool) -> None:
+    def iterate(self, number: int) -> None:
         """Run the motion once, with its updates."""
-        R, n = self.start.shape
-        q, v = self.start, np.zeros((R, n))
-        largest, distance = np.zeros(R), np.zeros(R)
+        settings, influences, h = self.settings, self.influences, self.dt[:, None]
+        q, v = self.start, np.zeros_like(self.start)
+        largest, distance = np.zeros(len(q)), np.zeros(len(q))
         torques, samples = [], []
-        for k in range(self.settings.updates):
+        for k in range(settings.updates):
             t = k * self.dt
             q_pr = self.motion.evaluate(t)
             q, v = self._reset_diverged(number, q, v, q_pr)
             distance = np.maximum(distance, np.abs(q - q_pr[0]).max(axis=1))
-            q_seen = self._sensed(q, self.influences.q)
-            v_seen = self._sensed(v, self.influences.v)
+            q_seen = influences.sensed(q, influences.q)
+            v_seen = influences.sensed(v, influences.v)
             q_star = reference_acceleration(q_seen, v_seen, q_pr, self.alpha, self.beta)  # (15)
             Psi = self.dynamics.regressor(q_seen, v_seen, q_star)  # (R, n, c), (22)
             u = np.einsum("rnc,rc->rn", Psi, self.P)  # (21)
-            applied = u if self.influences.torque is None else u + self.influences.torque(t, u)
-            a = self.plant.acceleration(q, v, applied)
-            a_seen = self._sensed(a, self.influences.a)
+            applied = u if influences.torque is None else u + influences.torque(t, u)
+            a = self.plant(q, v, applied)
+            a_seen = influences.sensed(a, influences.a)
             G = self.dynamics.regressor(q_seen, v_seen, a_seen)  # (12)
-            moved = G if self.settings.prx_acceleration == "measured" else Psi
-            prx = np.abs(proximity(moved, self.P, u, sign=self.settings.sign)).max(axis=1)  # (23)
+            moved = G if settings.prx_acceleration == "measured" else Psi
+            prx = np.abs(proximity(moved, self.P, u, sign=settings.sign)).max(axis=1)  # (23)
             largest = np.maximum(largest, prx)
-            if self.settings.method == "recursive":
+            if settings.method == "recursive":
                 eta = a_seen - q_star  # (20), the deviation of the real from the program motion
-                self._update(q_seen, Psi, eta, prx > self.settings.eps1)
+                self._update(q_seen, Psi, eta, prx > settings.eps1)
             else:
                 samples.append((G, Psi))
-            if keep_torques:
-                torques.append(u)
-            q, v = self._advance(q, v, a, applied)
+            torques.append(u[0])
+            q, v = rk4(lambda q, v, u=applied: self.plant(q, v, u), q, v, h, a)  # type: ignore[misc]
         if samples:
             self._update_once(samples)
-        self._store(number, largest, distance, torques)
-
-    def _sensed(self, value: Array, level: float | Array) -> Array:
-        """Return a measured value, with white noise of a standard deviation."""
-        rng = self.influences.rng
-        if rng is None or not np.any(np.asarray(level) != 0):
-            return value
-        noisy: Array = value + level * rng.standard_normal(value.shape)
-        return noisy
+        is_zero = self.active & (largest <= settings.eps1)
+        self.NA = np.where(is_zero, number, self.NA)  # (25)
+        self.active = self.active & ~is_zero
+        course = (self.P, largest, distance, np.stack(torques))
+        for values, value in zip(self.courses, course, strict=True):
+            values.append(value)
 
     def _update(self, q: Array, Psi: Array, eta: Array, is_open: NDArray[np.bool_]) -> None:
         """Apply (24), then (8)."""
-        sigma = smallest_eigenvalue(mass_matrix(self.dynamics, q, self.P))
+        sigma = smallest_eigenvalue(self.dynamics.mass_matrix(q, self.P))
         self.skipped = self.skipped + (self.active & (sigma <= 0.0))
         is_open = is_open & self.active
         P = recursive_update(self.P, Psi, eta, sigma, is_open, eps2=self.settings.eps2)
-        self.P = self._bounded(P)
+        self.P = self.settings.bounded(P)
 
     def _update_once(self, samples: list[tuple[Array, Array]]) -> None:
         """Apply (18) to the samples of one run, then (8)."""
         G, G_star = (np.stack(part, axis=1) for part in zip(*samples, strict=True))
         c, P = self.P.shape[1], self.P.copy()
         for r in np.flatnonzero(self.active):
-            stacked, names = (G[r].reshape(-1, c), G_star[r].reshape(-1, c)), self.dynamics.names
-            P[r] = one_shot(*stacked, self.P[r], names)
-        self.P = self._bounded(P)
-
-    def _bounded(self, P: Array) -> Array:
-        bounds = self.settings.bounds
-        return P if bounds is None else np.where(self.active[:, None], bounds.project(P), P)
-
-    def _advance(self, q: Array, v: Array, a: Array, u: Array) -> tuple[Array, Array]:
-        """Return the state one update later: Runge-Kutta of order 4 with constant torque."""
-        h = (self.dt / self.settings.substeps)[:, None]
-        for step in range(self.settings.substeps):
-            q, v = rk4(
-                lambda q, v, _: self.plant.acceleration(q, v, u), q, v, h, a if step == 0 else None
-            )
-        return q, v
+            stacked = G[r].reshape(-1, c), G_star[r].reshape(-1, c)
+            P[r] = one_shot(*stacked, self.P[r], self.dynamics.names)
+        self.P = self.settings.bounded(P)
 
     def _reset_diverged(
         self, number: int, q: Array, v: Array, program: tuple[Array, Array, Array]
@@ -272,36 +350,5 @@ class _Loop:
         diverges = ~(deviation < _DIVERGED)  # also with NaN
         self.diverged = np.where(diverges & self.active, number, self.diverged)
         self.active = self.active & ~diverges
-        has_diverged = diverges | (self.diverged > 0)
-        if not has_diverged.any():
-            return q, v
-        reset = has_diverged[:, None]
+        reset = (diverges | (self.diverged > 0))[:, None]
         return np.where(reset, program[0], q), np.where(reset, program[1], v)
-
-    def _store(self, number: int, largest: Array, distance: Array, torques: list[Array]) -> None:
-        is_zero = self.active & (largest <= self.settings.eps1)
-        self.NA = np.where(is_zero, number, self.NA)  # (25)
-        self.active = self.active & ~is_zero
-        self.estimates.append(self.P)
-        self.prx.append(largest)
-        self.tracking.append(distance)
-        if torques:
-            self.torques.append(np.stack(torques))
-
-    def history(self) -> History:
-        """Return the history of the runs."""
-        return History(
-            estimates=np.stack(self.estimates),
-            prx=np.stack(self.prx),
-            tracking=np.stack(self.tracking),
-            NA=self.NA,
-            diverged=self.diverged,
-            skipped=self.skipped,
-            torques=np.stack(self.torques) if self.torques else None,
-        )
-
-
-def _column(gain: float | Array) -> Array:
-    """Return a gain as a factor of arrays of shape (R, n)."""
-    array = np.asarray(gain, dtype=float)
-    return array[:, None] if array.ndim == 1 else array

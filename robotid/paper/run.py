@@ -1,7 +1,8 @@
-"""Run the paper's simulation and write its page and numerical results."""
+"""Run the paper's simulation and write its results, and a page of its figures and tables."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from html import escape
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,9 +14,17 @@ from robotid.base.typing import Array, ProgressCallback, ignore_progress
 from robotid.base.versions import __version__
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor
+from robotid.output.pages.html import (
+    Chart,
+    Series,
+    block,
+    chart_html,
+    listing,
+    number,
+    page,
+    text,
+)
 from robotid.output.viewer.replays import Torques, replay
-from robotid.paper.equations import PlanarDynamics, torque
-from robotid.paper.page import paper_page
 from robotid.paper.planar_2r import urdf_text
 from robotid.paper.procedure import LoopSettings
 from robotid.paper.study import (
@@ -24,7 +33,6 @@ from robotid.paper.study import (
     DURATION,
     MODELS,
     PROGRAM,
-    EnergyDrift,
     ModelStudy,
     PaperSettings,
     RandomRuns,
@@ -39,6 +47,42 @@ from robotid.robot.parameters import PAPER_TERMS, to_paper_order
 
 _ENOUGH = 1e-4  # [-] relative error at which the simulation has converged
 _SAMPLES = 241  # of the replay
+_SHOWN = (1, 2, 5, 20, 100)  # iterations drawn in figure 4
+_DRAWN_CASES = {
+    "clean": "clean", "disturbed": "torque ±10 %", "noisy": "noise",
+    "noisy_dead_zone": "noise, ε₂ = 1",
+}  # fmt: skip
+
+_RESULT = (
+    ("model", "text", "name"), ("start", ".2g", "start"), ("after 1", ".2g", "first"),
+    ("after 10", ".2g", "tenth"), ("at the end", ".2g", "last"),
+    ("start on program", ".2g", "on_program"), ("NA (25)", "d", "NA"),
+    ("one-shot (18)", ".2g", "one_shot"),
+)  # fmt: skip
+_PARAMETERS = (
+    ("parameter", "code", "name"), ("true", ".4g", "true"), ("estimate", ".7g", "estimate"),
+    ("difference", ".1e", "difference"),
+)  # fmt: skip
+_VECTOR = (
+    ("parameter", "code", "name"), ("true", ".4g", "true"), ("identified", ".7g", "identified"),
+)  # fmt: skip
+_DISTURBED = (
+    ("model", "text", "name"), ("case", "text", "case"), ("at the end", ".2g", "last"),
+    ("mean of last tenth", ".2g", "last_tenth"), ("of averaged P̂", ".2g", "averaged"),
+    ("≤ 10⁻⁴", "text", "converged"),
+)  # fmt: skip
+_RANDOM = (
+    ("model", "text", "name"), ("start", "text", "start"), ("runs", "d", "runs"),
+    ("converged", "d", "converged"), ("least", ".0f", "0"), ("median", ".0f", "50"),
+    ("90 %", ".0f", "90"), ("most", ".0f", "100"), ("allowed", "d", "most_iterations"),
+)  # fmt: skip
+_ERRATA = (
+    ("where", "code", "where"), ("printed", "text", "printed"), ("corrected", "text", "corrected"),
+    ("anywhere [N m]", ".1f", "max_torque_difference"),
+    ("on the program [N m]", ".1f", "max_torque_difference_on_program"),
+)  # fmt: skip
+_ENERGY = (("model", "text", "name"), ("%", ".3g", "change"))
+_SETTINGS = (("setting", "text", "name"), ("value", "text", "value"))
 
 
 def run_paper(
@@ -50,9 +94,6 @@ def run_paper(
     """Run the paper's simulation with its three models, write it and return paper.json's content.
 
     Every file is written in a temporary folder inside the target and then moved.
-
-    References:
-        Tzvetkova, section VI.
     """
     chosen = settings or PaperSettings()
     report = progress or ignore_progress
@@ -63,8 +104,8 @@ def run_paper(
         study_model(name, chosen, progress=_counter(name, chosen.iterations, report))
         for name in MODELS
     ]
-    near = _trajectories(chosen, "off", 0.05, chosen.patience, report)
-    exact = _trajectories(chosen, "on", 0.0, min(chosen.patience, chosen.iterations), report)
+    near = _random_motions(chosen, "off", 0.05, chosen.patience, report)
+    exact = _random_motions(chosen, "on", 0.0, min(chosen.patience, chosen.iterations), report)
     drift = energy_drift()
     arm, physical = _arm(), studies[list(MODELS).index("physical")]
     content = _content(chosen, studies, near, exact, drift)
@@ -79,7 +120,7 @@ def run_paper(
     return content
 
 
-def _trajectories(
+def _random_motions(
     settings: PaperSettings, where: str, largest: float, most: int, report: ProgressCallback
 ) -> dict[str, RandomRuns]:
     """Return the random motions of each model; they differ between the models."""
@@ -99,9 +140,9 @@ def _content(
     studies: list[ModelStudy],
     near: Mapping[str, RandomRuns],
     exact: Mapping[str, RandomRuns],
-    drift: EnergyDrift,
+    drift: tuple[Array, Mapping[str, Array]],
 ) -> dict[str, Any]:
-    loop = LoopSettings()
+    loop, (t, gained) = LoopSettings(), drift
     return {
         "schema_version": 1,
         "robotid": __version__,
@@ -125,8 +166,8 @@ def _content(
         "trajectories_on_program": {name: runs.to_dict() for name, runs in exact.items()},
         "errata": [asdict(e) for e in errata(np.random.default_rng(settings.seed))],
         "energy_drift": {
-            "duration": float(drift.t[-1]),
-            "max_relative": {n: float(np.abs(E).max()) for n, E in drift.gained.items()},
+            "duration": float(t[-1]),
+            "max_relative": {name: float(np.abs(E).max()) for name, E in gained.items()},
         },
     }
 
@@ -189,7 +230,7 @@ def _inertial_vector(arm: RobotModel, study: ModelStudy) -> dict[str, Any]:
     q, v, a = np.random.default_rng(0).uniform(-1.0, 1.0, (3, 20, 2))
     mapping = structural_mapping(arm, inertial_only=True)
     W_b = joint_torque_regressor(arm, q, v, a)[:, mapping.independent]  # (40, b)
-    u = torque(study.dynamics, q, v, a, study.history.estimates[-1, 0])  # (20, 2)
+    u = study.dynamics.torque(q, v, a, study.history.estimates[-1, 0])  # (20, 2)
     beta = np.linalg.lstsq(W_b, u.ravel())[0]
     return {
         "names": [f"{body}.{term}" for body in arm.layout.bodies for term in PAPER_TERMS],
@@ -202,14 +243,15 @@ def _write_replay(arm: RobotModel, study: ModelStudy, target: Path) -> None:
     """Write the replay of the program motion (28), with the torques of the estimates."""
     t = np.linspace(0.0, DURATION, _SAMPLES)
     q, v, a = PROGRAM.evaluate(t)
-    dynamics = PlanarDynamics("corrected")
     estimates = study.history.estimates[:, 0]
-    last = len(estimates) - 1
-    guesses = {"initial values": estimates[0], f"after {last} iterations": estimates[-1]}
+    label = f"after {len(estimates) - 1} iterations"
     torques = Torques(
         t,
-        torque(dynamics, q, v, a, study.P),
-        {label: torque(dynamics, q, v, a, P) for label, P in guesses.items()},
+        study.dynamics.torque(q, v, a, study.P),
+        {
+            "initial values": study.dynamics.torque(q, v, a, estimates[0]),
+            label: study.dynamics.torque(q, v, a, estimates[-1]),
+        },
     )
     notes = ["Program motion (28). Colour of the arcs: residual of the initial values."]
     replay(arm, t, q, torques=torques, notes=notes).write(target)
@@ -217,3 +259,244 @@ def _write_replay(arm: RobotModel, study: ModelStudy, target: Path) -> None:
 
 def _counter(what: str, most: int, report: ProgressCallback) -> Callable[[int], None]:
     return lambda number: report(what, number, most, "iterations")
+
+
+# ---- the page -------------------------------------------------------------------------------
+
+
+def paper_page(
+    content: Mapping[str, Any],
+    studies: Sequence[ModelStudy],
+    drift: tuple[Array, Mapping[str, Array]],
+) -> str:
+    """Return the page, with figures 3 to 5 of the paper."""
+    result = block("paper.result") + _result_table(content) + _parameter_tables(content)
+    figures = _program_figures() + _control_figures(studies) + _estimate_figures(studies)
+    disturbed = _disturbance(content) + _disturbed_figures(studies)
+    sections = {
+        "result": ("Accuracy of the estimates", result + _vector_table(content)),
+        "figures": ("The paper's figures", figures),
+        "convergence": ("Proximity and error", _convergence_figures(studies)),
+        "disturbance": ("Disturbance and noise", disturbed),
+        "trajectories": ("Random trajectories", _trajectories(content)),
+        "errata": ("Errata", block("paper.errata") + listing("Errata", _ERRATA, content["errata"])),
+        "energy": ("Energy", _energy(content) + _energy_figure(*drift)),
+        "settings": ("Settings", _settings(content)),
+    }
+    return page("The paper's simulation", _summary(content), sections)
+
+
+def _summary(content: Mapping[str, Any]) -> str:
+    models, on_program = content["models"], content["on_program"]
+    last = {name: model["relative_error"][-1] for name, model in models.items()}
+    others = {name: on_program[name]["relative_error"][-1] for name in models}
+    gains = [others[name] / error for name, error in last.items()]
+    reached = "".join(
+        block(
+            "paper.reached",
+            name=escape(name),
+            error=number(error, ".2g").html,
+            on_program=number(others[name], ".2g").html,
+        )
+        for name, error in last.items()
+    )
+    beside = np.degrees(np.max(np.abs(content["settings"]["start_beside_program_rad"])))
+    return block(
+        "paper.summary",
+        status="good" if max(last.values()) <= _ENOUGH else "poor",
+        count=len(next(iter(models.values()))["relative_error"]) - 1,
+        reached=reached,
+        beside=f"{beside:.3g}",
+        least=f"{min(gains):.2g}",
+        most=f"{max(gains):.2g}",
+        version=__version__,
+    )
+
+
+# ---- tables ---------------------------------------------------------------------------------
+
+
+def _result_table(content: Mapping[str, Any]) -> str:
+    rows = []
+    for name, model in content["models"].items():
+        errors = model["relative_error"]
+        rows.append(
+            {"name": name, "start": errors[0], "first": errors[min(1, len(errors) - 1)],
+             "tenth": errors[10] if len(errors) > 10 else None, "last": errors[-1],
+             "on_program": content["on_program"][name]["relative_error"][-1],
+             "NA": model["NA"], "one_shot": content["one_shot"][name]}
+        )  # fmt: skip
+    return listing("Relative error |P̂ − P| / |P|", _RESULT, rows)
+
+
+def _parameter_tables(content: Mapping[str, Any]) -> str:
+    html = ""
+    for name, model in content["models"].items():
+        values = zip(model["names"], model["P_true"], model["P_hat"][-1], strict=True)
+        rows = [
+            {"name": parameter, "true": P, "estimate": P_hat, "difference": P_hat - P}
+            for parameter, P, P_hat in values
+        ]
+        html += listing(f"{name}: parameters at the end [kg m²]", _PARAMETERS, rows)
+    return html
+
+
+def _vector_table(content: Mapping[str, Any]) -> str:
+    vector = content["inertial_vector"]
+    values = zip(vector["names"], vector["true"], vector["identified"], strict=True)
+    rows = [{"name": name, "true": pi, "identified": x} for name, pi, x in values]
+    return block("paper.vector") + listing("Inertial vector (9)-(10), SI units", _VECTOR, rows)
+
+
+def _disturbance(content: Mapping[str, Any]) -> str:
+    rows = [
+        {**entry, "name": name, "case": CASES[case].title, "last": entry["relative_error"][-1],
+         "converged": text("yes" if entry["converged"] else "no", flag=not entry["converged"])}
+        for case in ("disturbed", "noisy", "noisy_dead_zone")
+        for name, entry in content[case].items()
+    ]  # fmt: skip
+    reason = next(iter(content["disturbed"].values()))["reason"]
+    return f"<p>{escape(reason)}</p>\n" + listing("Relative error at the end", _DISTURBED, rows)
+
+
+def _trajectories(content: Mapping[str, Any]) -> str:
+    starts = {
+        "trajectories": "up to 0.05 rad off the program",
+        "trajectories_on_program": "on the program",
+    }
+    rows = []
+    for key, start in starts.items():
+        for name, run in content[key].items():
+            reached = run["iterations"] or [float("nan")]
+            quantiles = {f"{p}": float(np.percentile(reached, p)) for p in (0, 50, 90, 100)}
+            rows.append({**run, **quantiles, "name": name, "start": start})
+    table = listing("Iterations to a relative error of 10⁻³", _RANDOM, rows)
+    return block("paper.trajectories") + table
+
+
+def _energy(content: Mapping[str, Any]) -> str:
+    drift = content["energy_drift"]
+    rows = [{"name": name, "change": 100 * x} for name, x in drift["max_relative"].items()]
+    table = listing("Largest change of energy", _ENERGY, rows)
+    return block("paper.energy", duration=f"{drift['duration']:g}") + table
+
+
+def _settings(content: Mapping[str, Any]) -> str:
+    rows = []
+    for key, value in content["settings"].items():
+        words, _, unit = key.rpartition("_")
+        name = f"{words} [{unit}]" if unit in ("rad", "s") else key
+        rows.append({"name": name.replace("_", " "), "value": _written(value)})
+    return listing("Settings", _SETTINGS, rows)
+
+
+def _written(value: object) -> str:
+    """Return the value of a setting as text; numbers of a list with commas."""
+    if isinstance(value, list):
+        return ", ".join(map(_written, value))
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+# ---- figures --------------------------------------------------------------------------------
+
+
+def _plots(*charts: Chart) -> str:
+    """Return charts side by side, each under its title."""
+    html = "".join(chart_html(chart, escape(chart.title)) for chart in charts)
+    return f'<div class="plots">\n{html}</div>\n'
+
+
+def _lines(values: Mapping[str, Array], first: int = 1, *, is_weak: bool = False) -> list[Series]:
+    """Return lines over iterations, filled up with NaN to the longest."""
+    count = max(map(len, values.values()))
+    padded = {k: np.append(y, np.full(count - len(y), np.nan)) for k, y in values.items()}
+    return [
+        Series(name, y, f"tone-{k}", is_weak=is_weak)
+        for k, (name, y) in enumerate(padded.items(), start=first)
+    ]
+
+
+def _over_iterations(title: str, label: str, series: Sequence[Series], axis: str = "") -> Chart:
+    x = np.arange(len(series[0].y), dtype=float)
+    return Chart(title, x, tuple(series), "iteration", label, logarithmic=axis)
+
+
+def _program_figures() -> str:
+    """Return the program motion (28) of both links."""
+    t = np.linspace(0.0, DURATION, 201)
+    names = ("position [rad]", "velocity [rad/s]", "acceleration [rad/s²]")
+    charts = [
+        Chart(
+            f"Figure 3({'ab'[j]}). Program motion of link {j + 1}, (28)", t,
+            (Series(name, part[:, j], f"tone-{k}"),), "time [s]", name, height=120,
+        )
+        for j in range(2)
+        for k, (name, part) in enumerate(zip(names, PROGRAM.evaluate(t), strict=True), start=1)
+    ]  # fmt: skip
+    return _plots(*charts)
+
+
+def _control_figures(studies: Sequence[ModelStudy]) -> str:
+    """Return the control (21) of both joints in successive iterations, and less the last one."""
+    charts = []
+    for study in studies:
+        control = study.history.torques
+        t, program = study.program_control(control.shape[1] + 1)
+        for j in range(2):
+            torques, last = control[:, :, j], control[-1, :, j]
+            drawn = {f"iteration {k}": torques[k - 1] for k in _SHOWN if k <= len(torques)}
+            title = f"Figure 4({'ab'[j]}). {study.name}: control u{j + 1} (21)"
+            series = [*_lines(drawn), Series("program control", program[:-1, j], "text")]
+            less = _lines({name: u - last for name, u in drawn.items()})
+            label = f"torque u{j + 1} [N m]"
+            charts.append(Chart(title, t[:-1], tuple(series), "time [s]", label))
+            charts.append(Chart(f"{title}, minus the last", t[:-1], tuple(less), "time [s]", label))
+    return _plots(*charts)
+
+
+def _estimate_figures(studies: Sequence[ModelStudy]) -> str:
+    """Return the estimated parameters (24) over the iterations, and the true ones."""
+    charts = []
+    for study in studies:
+        names, P_hat = study.dynamics.names, study.history.estimates[:, 0]
+        lines = _lines(dict(zip(names, P_hat.T, strict=True)))
+        true = {
+            f"{name}, true": np.full(len(P_hat), x) for name, x in zip(names, study.P, strict=True)
+        }
+        title = f"Figure 5. {study.name}: estimates (24)"
+        series = [*lines, *_lines(true, is_weak=True)]
+        charts.append(_over_iterations(title, "estimate [kg m²]", series))
+    return _plots(*charts)
+
+
+def _convergence_figures(studies: Sequence[ModelStudy]) -> str:
+    """Return PRX (23) and the parameter error over the iterations."""
+    prx = _lines({s.name: np.append(np.nan, s.history.prx[:, 0]) for s in studies})
+    errors = _lines({study.name: study.errors() for study in studies})
+    on_program = {f"{s.name}, start on program": s.errors("on_program") for s in studies}
+    errors += _lines(on_program, is_weak=True)
+    label = "|P̂ − P| / |P|"
+    return _plots(
+        _over_iterations("Largest entry of PRX (23)", "PRX [N m/s²]", prx, "y"),
+        _over_iterations("Parameter error", label, errors, "y"),
+    )
+
+
+def _disturbed_figures(studies: Sequence[ModelStudy]) -> str:
+    """Return the parameter error under disturbance and noise."""
+    return _plots(*(
+        _over_iterations(
+            f"{study.name}: parameter error with disturbed torque and noisy sensors",
+            "|P̂ − P| / |P|",
+            _lines({label: study.errors(case) for case, label in _DRAWN_CASES.items()}),
+            "y",
+        )
+        for study in studies
+    ))  # fmt: skip
+
+
+def _energy_figure(t: Array, gained: Mapping[str, Array]) -> str:
+    """Return the energy gained by each model in free motion."""
+    lines = _lines({name: 100 * share for name, share in gained.items()})
+    title = "Energy gained in free motion"
+    return _plots(Chart(title, t, tuple(lines), "time [s]", "energy gained [%]"))

@@ -7,6 +7,7 @@ it, the error is 1e-5. The simulation starts one degree off, and reports both.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,23 +17,24 @@ from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.dynamics.simulation.motions import ProgramMotion
-from robotid.paper.equations import (
-    LinearDynamics,
-    LinearPlant,
-    PlanarDynamics,
-    mass_matrix,
-    rk4,
-    torque,
-)
 from robotid.paper.planar_2r import (
     PAPER_LINKS,
     PAPER_PARAMETERS,
+    PARAMETER_NAMES,
     Form,
     parameters,
     printed_velocity_coefficient,
     regressor,
 )
-from robotid.paper.procedure import History, Influences, LoopSettings, random_torque, run_procedure
+from robotid.paper.procedure import (
+    History,
+    Influences,
+    LinearDynamics,
+    LoopSettings,
+    random_torque,
+    rk4,
+    run_procedure,
+)
 
 #: The three models and the form of the regressor of each.
 MODELS: dict[str, Form] = {
@@ -46,7 +48,6 @@ PROGRAM = ProgramMotion(np.array(AMPLITUDE), DURATION)
 _START = (np.pi / 180, 0.0)  # [rad] start of the robot relative to its program
 _EPS1 = 1e-9  # [N m / s^2] PRX below it is zero
 TOLERANCE = 1e-3  # [-] relative error at which a run has converged
-_DRAWN = ("amplitude", "duration", "gain", "guess", "offset")  # random properties of a run
 _STALLED = 1e-3  # [-] smallest relative decrease of the error over ten iterations
 
 
@@ -93,48 +94,42 @@ class ModelStudy:
     """The results of the simulation of one model."""
 
     name: str  # its name in ``MODELS``
-    dynamics: PlanarDynamics  # its regressor
-    P: Array  # its true parameters, shape (c,) [kg m^2]
+    dynamics: LinearDynamics  # its regressor
+    P: Array  # (c,), its true parameters [kg m^2]
     history: History  # one run per case, in the order of ``CASES``
     NA: int | None  # first iteration in which PRX was zero without disturbance, or None
     one_shot_error: float  # relative error of (18) after one run of the motion
 
     def errors(self, case: str = "clean") -> Array:
-        """Return the relative error before the first iteration and after each: -> (L + 1,)."""
+        """Return the relative error before the first iteration and after each, (L + 1,)."""
         column: Array = self.history.relative_error(self.P)[:, list(CASES).index(case)]
         return column
 
     def program_control(self, points: int) -> tuple[Array, Array]:
-        """Return the control of the program motion, G(q_pr, v_pr, a_pr) P.
-
-        References:
-            Tzvetkova, (14); figure 4.
-
-        -> (N,) [s], (N, 2) [N m].
-        """
+        """Return times (N,) and the control of the program motion (14), (N, 2) [N m]."""
         t = np.linspace(0.0, DURATION, points)
-        return t, torque(self.dynamics, *PROGRAM.evaluate(t), self.P)
+        return t, self.dynamics.torque(*PROGRAM.evaluate(t), self.P)
 
 
-def paper_arm(name: str) -> tuple[PlanarDynamics, Array]:
-    """Return one of the three models and its true parameters: -> (c,) [kg m^2]."""
+def planar_dynamics(form: Form = "corrected") -> LinearDynamics:
+    """Return the paper's arm in closed form."""
+    return LinearDynamics(PARAMETER_NAMES[form], partial(regressor, form=form))
+
+
+def paper_arm(name: str) -> tuple[LinearDynamics, Array]:
+    """Return one of the three models and its true parameters, (c,) [kg m^2]."""
     if name not in MODELS:
         raise SettingsError(f"model is {name!r}, wanted one of {listed(MODELS)}")
     P = parameters(PAPER_LINKS) if name == "physical" else PAPER_PARAMETERS
-    return PlanarDynamics(MODELS[name]), P
+    return planar_dynamics(MODELS[name]), P
 
 
 def study_model(
     name: str, settings: PaperSettings, *, progress: Callable[[int], None] | None = None
 ) -> ModelStudy:
-    """Run the paper's simulation of one model, in every case.
-
-    References:
-        Tzvetkova, section VI.
-    """
+    """Run the paper's simulation (section VI) of one model, in every case."""
     dynamics, P = paper_arm(name)
-    plant = LinearPlant(dynamics, P)
-    cases = list(CASES.values())
+    plant, cases = partial(dynamics.acceleration, P=P), list(CASES.values())
     history = run_procedure(
         dynamics,
         plant,
@@ -145,7 +140,6 @@ def study_model(
         ),
         offset=np.array([case.offset for case in cases]),
         influences=_influences(cases, np.random.default_rng(settings.seed)),
-        keep_torques=True,
         progress=progress,
     )
     endless = LoopSettings(iterations=settings.longest, eps1=_EPS1)
@@ -154,14 +148,8 @@ def study_model(
         run_procedure(dynamics, plant, PROGRAM, P[None] / 2, settings=s, offset=np.array(_START))
         for s in (endless, once)
     )
-    return ModelStudy(
-        name=name,
-        dynamics=dynamics,
-        P=P,
-        history=history,
-        NA=int(further.NA[0]) or None,
-        one_shot_error=float(single.relative_error(P)[-1, 0]),
-    )
+    first, error = int(further.NA[0]) or None, float(single.relative_error(P)[-1, 0])
+    return ModelStudy(name, dynamics, P, history, first, error)
 
 
 def _influences(cases: list[Case], rng: np.random.Generator) -> Influences:
@@ -175,12 +163,11 @@ def _influences(cases: list[Case], rng: np.random.Generator) -> Influences:
 class RandomRuns:
     """R random motions, and the course of the estimate on each."""
 
-    amplitude: Array  # of each motion (28), shape (R, n) [rad]
-    duration: Array  # of each motion, shape (R,) [s]
-    gain: Array  # bandwidth w of the control, alpha = 2 w and beta = w^2, shape (R,) [1/s]
-    guess: Array  # initial values, shape (R, c)
-    offset: Array  # start of the robot relative to its program, shape (R, n) [rad]
-    errors: Array  # relative error before the first iteration and after each, shape (L + 1, R)
+    #: Of each run, R rows each: amplitude [rad] and duration [s] of the motion (28), bandwidth w of
+    #: the control, alpha = 2 w and beta = w^2, as gain [1/s], initial values as guess, and offset,
+    #: the start of the robot relative to its program [rad].
+    drawn: dict[str, Array]
+    errors: Array  # (L + 1, R), relative error before the first iteration and after each
     history: History  # the course of the runs
 
     @property
@@ -197,25 +184,25 @@ class RandomRuns:
     @property
     def failures(self) -> list[dict[str, Any]]:
         """Each run without convergence: its number, the reason, the final error, its settings."""
-        return [self._failure(int(r)) for r in np.flatnonzero(~self.has_converged)]
+        return [
+            {
+                "run": r,
+                "reason": self._reason(r),
+                "relative_error": float(self.errors[-1, r]),
+                **{key: values[r].tolist() for key, values in self.drawn.items()},
+            }
+            for r in np.flatnonzero(~self.has_converged).tolist()
+        ]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the part of paper.json."""
         return {
-            "runs": len(self.guess),
+            "runs": len(self.has_converged),
             "converged": int(self.has_converged.sum()),
             "tolerance": TOLERANCE,
             "most_iterations": len(self.errors) - 1,
             "iterations": self.iterations,
             "failures": self.failures,
-        }
-
-    def _failure(self, r: int) -> dict[str, Any]:
-        return {
-            "run": r,
-            "reason": self._reason(r),
-            "relative_error": float(self.errors[-1, r]),
-            **{key: getattr(self, key)[r].tolist() for key in _DRAWN},
         }
 
     def _reason(self, r: int) -> str:
@@ -240,26 +227,25 @@ def random_runs(
     """Run the procedure with random motions, initial values, gains and starts.
 
     Each joint moves by 0.5 to 2 rad in either direction in 1 to 3 s. The initial value of each
-    parameter is 0.3 to 1.7 times its true value. The bandwidth is 5 to 20 1/s.
-
-    P (c,).
+    parameter is 0.3 to 1.7 times its true value, P (c,). The bandwidth is 5 to 20 1/s.
     """
-    n = dynamics.n_joints
+    n = len(AMPLITUDE)
     amplitude = rng.uniform(0.5, 2.0, (runs, n)) * rng.choice([-1.0, 1.0], (runs, n))
     duration, gain = rng.uniform(1.0, 3.0, runs), rng.uniform(5.0, 20.0, runs)
     guess = P * rng.uniform(0.3, 1.7, (runs, len(P)))
     offset = largest_offset * rng.uniform(-1.0, 1.0, (runs, n))
     history = run_procedure(
         dynamics,
-        LinearPlant(dynamics, P),
+        partial(dynamics.acceleration, P=P),
         ProgramMotion(amplitude, duration),
         guess,
         settings=LoopSettings(alpha=2 * gain, beta=gain**2, iterations=iterations),
         offset=offset,
         progress=progress,
     )
-    errors = history.relative_error(P)
-    return RandomRuns(amplitude, duration, gain, guess, offset, errors, history)
+    drawn = {"amplitude": amplitude, "duration": duration, "gain": gain}
+    drawn |= {"guess": guess, "offset": offset}
+    return RandomRuns(drawn, history.relative_error(P), history)
 
 
 def _course(error: Array) -> str:
@@ -294,23 +280,11 @@ class Erratum:
     max_torque_difference_on_program: float  # the largest along the program motion [N m]
 
 
-@dataclass(frozen=True)
-class EnergyDrift:
-    """Kinetic energy of the arm without torque."""
-
-    t: Array  # times, shape (N,) [s]
-    # per model, the energy gained since the start over the initial energy, shape (N,)
-    gained: dict[str, Array]
-
-
 def errata(rng: np.random.Generator) -> list[Erratum]:
     """Return the errata that change a torque, each with its largest torque difference.
 
     The last one is that of (22) in (23). Proof: u of (21) is C(q, v, P^) + D(q, P^) q_*, linear in
     P^, so u = Psi P^ with its gradient Psi (22), and PRX = Psi^T (Psi P^ - u) = 0 for every P^.
-
-    References:
-        Tzvetkova, (21)-(27).
     """
     somewhere = tuple(size * rng.uniform(-1, 1, (_STATES, 2)) for size in _RANGE)
     program = PROGRAM.evaluate(np.linspace(0, DURATION, 401))
@@ -328,11 +302,14 @@ def errata(rng: np.random.Generator) -> list[Erratum]:
     return [Erratum(*text, *sizes) for text, *sizes in zip(texts, *largest, strict=True)]
 
 
-def energy_drift(*, duration: float = 10.0, dt: float = 4e-3) -> EnergyDrift:
-    """Return the energy of each model in free motion; that of a rigid arm is constant."""
+def energy_drift(*, duration: float = 10.0, dt: float = 4e-3) -> tuple[Array, dict[str, Array]]:
+    """Return times and the kinetic energy that each model gains without torque, over its first.
+
+    That of a rigid arm is constant. Shapes (N,) [s] and (N,) [-].
+    """
     t = dt * np.arange(round(duration / dt) + 1)
     energy = {name: _free_energy(name, len(t), dt) for name in MODELS}
-    return EnergyDrift(t, {name: E / E[0] - 1.0 for name, E in energy.items()})
+    return t, {name: E / E[0] - 1.0 for name, E in energy.items()}
 
 
 def _differences(q: Array, v: Array, a: Array) -> list[Array]:
@@ -346,25 +323,20 @@ def _differences(q: Array, v: Array, a: Array) -> list[Array]:
     swapped = (G_printed - G) @ five
     p4 = G_printed @ (PAPER_PARAMETERS - five)
     residual = 2 * (regressor(q, v, a) @ P)  # Psi P + u instead of Psi P - u = 0
-    return [missing, swapped, p4, residual, _omitted_residual(q, v, a, P)]
-
-
-def _omitted_residual(q: Array, v: Array, q_star: Array, P: Array) -> Array:
-    """Return the residual of P^ = P / 2 that (22) omits, G P^ - Psi P^, shape (N, 2)."""
-    arm, P_hat = PlanarDynamics("corrected"), P / 2
-    u = torque(arm, q, v, q_star, P_hat)  # (21), Psi P^
-    a = LinearPlant(arm, P).acceleration(q, v, u)
-    return torque(arm, q, v, a, P_hat) - u
+    arm, P_hat = planar_dynamics(), P / 2
+    u = arm.torque(q, v, a, P_hat)  # (21), Psi P^ with q_* = a
+    omitted = arm.torque(q, v, arm.acceleration(q, v, u, P), P_hat) - u  # by (22): G P^ - Psi P^
+    return [missing, swapped, p4, residual, omitted]
 
 
 def _free_energy(name: str, steps: int, h: float) -> Array:
-    dynamics, P = paper_arm(name)
-    plant, (q, v), nothing = LinearPlant(dynamics, P), _FREE, np.zeros((1, 2))
+    (dynamics, P), (q, v) = paper_arm(name), _FREE
+    free = partial(dynamics.acceleration, u=np.zeros((1, 2)), P=P)
     states = []
     for _ in range(steps):
         states.append((q[0], v[0]))
-        q, v = rk4(lambda q, v, _: plant.acceleration(q, v, nothing), q, v, h)
+        q, v = rk4(free, q, v, h)
     angles, speeds = (np.array(part) for part in zip(*states, strict=True))
-    D = mass_matrix(dynamics, angles, P)
+    D = dynamics.mass_matrix(angles, P)
     energy: Array = np.einsum("ki,kij,kj->k", speeds, D, speeds) / 2
     return energy

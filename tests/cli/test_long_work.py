@@ -124,7 +124,7 @@ def test_a_signal_ends_a_run_with_one_line_and_without_files(job, tmp_path, numb
 
 def test_an_address_where_nobody_listens_is_said(job, tmp_path, capsys, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("robotid.estimation.workers.plan._ANSWER", 0.2)
+    monkeypatch.setattr("robotid.estimation.work_plan._ANSWER", 0.2)
     words = ["identify", job, "--out", str(tmp_path), "--scheduler", "tcp://127.0.0.1:9"]
     assert main(words) == 1
     assert "workers answers at 'tcp://127.0.0.1:9'" in capsys.readouterr().err

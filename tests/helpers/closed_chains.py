@@ -101,10 +101,7 @@ def _model(path, text, **options):
 class Oracle:
     """Pinocchio's constraint dynamics of a robot with loops of ball joints, on point feet or none.
 
-    Args:
-        model: The robot.
-        pi: Its parameters.
-        feet: Links whose origins do not accelerate.
+    Origins of the links ``feet`` do not accelerate.
     """
 
     def __init__(self, model, pi, feet=()):

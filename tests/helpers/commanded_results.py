@@ -57,12 +57,8 @@ def _moments(model, pi):
 def written_result(plant, folder, *, position=None, limits=None, **changes):
     """Write the result of a plant whose drives were found exactly; return its folder.
 
-    Args:
-        plant: The robot.
-        folder: Where.
-        position: Friction that depends on the position by joint, as of ``by_position``.
-        limits: Effort limits of the controller by joint.
-        changes: Keys of result.json that are otherwise.
+    Position is friction that depends on it by joint, as of ``by_position``; limits are effort
+    limits of the controller; changes are keys of result.json that are otherwise.
     """
     position = position or {}
     model = plant.model.with_terms({joint: terms for joint, (terms, _) in position.items()})

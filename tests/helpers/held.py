@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from robotid.cli import main
-from robotid.estimation.workers.plan import WorkPlan
+from robotid.estimation.work_plan import WorkPlan
 
 _map = WorkPlan.map
 

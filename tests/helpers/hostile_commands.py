@@ -26,10 +26,11 @@ from helpers.hostile_inputs import (
     places,
     plain,
     replacements,
-    toml,
+    toml_file,
     values,
     write_csv,
 )
+from helpers.hostile_urdfs import any_of
 from helpers.recorders import write_lerobot
 from robotid.data.files.read import write_log
 from robotid.data.log import Log
@@ -53,9 +54,7 @@ def flagged(pairs):
     return [word for pair in pairs for word in pair]
 
 
-numbers = st.sampled_from(
-    ["0", "-1", "1", "2", "0.5", "1e-9", "1e-300", "1e9", "1e300", "100000", "nan", "inf", "x", ""]
-)
+numbers = any_of("0 -1 1 2 0.5 1e-9 1e-300 1e9 1e300 100000 nan inf x") | st.just("")
 
 # --- robotid excite ------------------------------------------------------------------------------
 
@@ -97,7 +96,7 @@ def robot_file(name, mass, folder):
     return path
 
 
-wild = numbers | st.sampled_from(["1e6", "1e-6", "0.1", "10", "1e12"])
+wild = numbers | any_of("1e6 1e-6 0.1 10 1e12")
 of_joint = st.tuples(st.sampled_from([*JOINTS, *JOINTS, "x", ""]), wild).map("=".join)
 #: What a flag may be, to its ends.
 RANGED = {
@@ -125,10 +124,7 @@ excite_flags = st.one_of(
     ranged(RANGED),
     ranged(RANGED),
     st.tuples(st.sampled_from([*sorted(RANGED), "--seed", "--gain"]), numbers),
-    st.tuples(
-        st.sampled_from(["--max-acceleration", "--max-jerk", "--max-power", "--noise", "--lock"]),
-        of_joint,
-    ),
+    st.tuples(any_of("--max-acceleration --max-jerk --max-power --noise --lock"), of_joint),
     st.tuples(st.just("--box"), st.sampled_from(BOXES)),
 )
 kinds = st.sampled_from([["--kind", kind] for kind in ("fourier", "bspline", "sweeps", "stands")])
@@ -171,10 +167,8 @@ def keys_of(schema, prefix=()):
 #: What the settings of a kind may be, to their ends.
 MILD = {
     bool: st.booleans(),
-    str: st.sampled_from(
-        ["usual", "none", "pd", "feedforward", "computed_torque", "perfect", "joint", "motor",
-         "torque", "find", "urdf", "one", "group", "link_1", "link_2"]
-    ),
+    str: any_of("usual none pd feedforward computed_torque perfect joint motor torque find urdf "
+                "one group link_1 link_2"),
     float: st.sampled_from([0, 1e-9, 1e-3, 0.05, 0.5, 1, 1.0, 5.0, 30.0, 1e3, 1e5, 1e9, 1e12]),
     list: st.sampled_from([[0.0, 0.0, 0.1], [1.0, 0.0, 1.0, 0.0, 0.0, 1.0], [1e9] * 6, [JOINTS]]),
 }  # fmt: skip
@@ -201,21 +195,15 @@ def settings_of(draw, schema):
     return table
 
 
+numeric_flags = any_of(
+    "--seed --rate --duration --perturb --torque-noise --limits --payload --cutoff"
+)
 simulate_flags = st.one_of(
-    st.tuples(
-        st.sampled_from(
-            ["--seed", "--rate", "--duration", "--perturb", "--torque-noise", "--limits",
-             "--payload", "--cutoff"]
-        ),
-        wild,
-    ),
-    st.tuples(
-        st.just("--controller"),
-        st.sampled_from(["pd", "feedforward", "computed_torque", "perfect", "x"]),
-    ),
+    st.tuples(numeric_flags, wild),
+    st.tuples(st.just("--controller"), any_of("pd feedforward computed_torque perfect x")),
     st.tuples(st.just("--joints"), st.sampled_from(["joint_1", "joint_2,joint_1", "x", ""])),
     st.tuples(st.just("--lock"), of_joint),
-)  # fmt: skip
+)
 
 
 def simulations():
@@ -237,15 +225,11 @@ def run_simulate(example, folder):
         write_log(good_log(), path)
     else:
         write_csv(motion, path)
-    (folder / "plant.toml").write_text(_as_toml(plant), encoding="utf-8")
+    (folder / "plant.toml").write_text(toml_file(plant), encoding="utf-8")
     obey(
         "simulate", URDF, path, "--rate", "100", "--plant", folder / "plant.toml",
         "--out", out / f"log{suffix}", "--urdf", out / "true.urdf", *flagged(given), out=out,
     )  # fmt: skip
-
-
-def _as_toml(table):
-    return "\n".join(f"{json.dumps(key)} = {toml(value)}" for key, value in table.items())
 
 
 # --- LeRobot datasets ----------------------------------------------------------------------------
@@ -268,10 +252,7 @@ odd_names = st.sampled_from(
      [None, None], [""], ["joint_1.pos", "joint_1"], [".pos", ".vel"], ["a\0b", "\ud800"],
      ["joint_1", "joint_2", "joint_3"], [["joint_1", "joint_2"]], [MARKUP, "x" * 3000]]
 )  # fmt: skip
-odd_columns = st.sampled_from(
-    ["drop", "null", "text", "ragged", "scalar", "huge", "empty", "index", "two files", "no rows",
-     "bytes"]
-)  # fmt: skip
+odd_columns = any_of("drop null text ragged scalar huge empty index two-files no-rows bytes")
 
 
 @st.composite
@@ -281,16 +262,13 @@ def datasets(draw):
     content = edited(content, draw(edits(list(places(content)), replacements | odd_names)))
     features = content.get("features") if isinstance(content, dict) else None
     if isinstance(features, dict) and draw(st.booleans()):
-        feature = draw(st.sampled_from(["observation.state", "action", "observation.effort"]))
-        features[feature] = draw(
-            st.fixed_dictionaries({"names": odd_names, "shape": st.sampled_from([[2], None, 5])})
-            | replacements
-        )
+        feature = draw(any_of("observation.state action observation.effort"))
+        odd = {"names": odd_names, "shape": st.sampled_from([[2], None, 5])}
+        features[feature] = draw(st.fixed_dictionaries(odd) | replacements)
     text = json.dumps(content)
     if draw(st.integers(0, 9)) == 0:
         text = draw(st.sampled_from(["", "[" * 100_000, "{}", "null", text[:-20], "\ufeff" + text]))
-    column = draw(st.sampled_from(["observation.state", "action", "timestamp", "episode_index",
-                                   "frame_index"]))  # fmt: skip
+    column = draw(any_of("observation.state action timestamp episode_index frame_index"))
     return text, draw(st.none() | odd_columns), column, draw(st.sampled_from(TOPICS))
 
 
@@ -325,9 +303,9 @@ def spoil_dataset(path, what, column):
         pq.write_table(table.set_column(place, column, other[what]), path)
     elif what == "drop":
         pq.write_table(table.remove_column(place), path)
-    elif what == "no rows":
+    elif what == "no-rows":
         pq.write_table(table.slice(0, 0), path)
-    elif what == "two files":
+    elif what == "two-files":
         pq.write_table(table.remove_column(place), path.with_name("other.parquet"))
     elif what == "bytes":
         path.write_bytes(path.read_bytes()[:200])
@@ -395,9 +373,7 @@ TABLES = {
 @st.composite
 def drive_jobs(draw):
     """The tables of a job file whose drives, gears and couplings are hostile."""
-    table = {
-        "estimator": {"name": draw(st.sampled_from(["ols", "wls", "consistent", "consistent"]))}
-    }
+    table = {"estimator": {"name": draw(any_of("ols wls consistent consistent"))}}
     for name in draw(st.lists(st.sampled_from(sorted(TABLES)), min_size=1, max_size=2)):
         table[name] = draw(TABLES[name])
     return table
@@ -422,7 +398,7 @@ def run_drive_job(table, folder, samples=200):
     table["output"] = {"report": False}
     write_log(log, folder / "fit.csv")
     path, out = folder / "job.toml", folder / "out"
-    path.write_text(_as_toml(table), encoding="utf-8", errors="replace")
+    path.write_text(toml_file(table), encoding="utf-8", errors="replace")
     obey("identify", path, "--out", out, out=out)
 
 

@@ -21,7 +21,7 @@ import pyarrow.parquet
 import scipy.io
 from hypothesis import strategies as st
 
-from helpers.hostile_urdfs import run_urdf, urdf_inputs
+from helpers.hostile_urdfs import any_of, run_urdf, urdf_inputs
 from helpers.paths import URDF as URDF_FOLDER
 from helpers.recorders import messages_of, write_bag1, write_bag2, write_mcap
 from helpers.synthetic import exact_log, truth
@@ -87,9 +87,9 @@ def read_log_file(write, suffix, example, folder):
     obey("convert", path, folder / "out.csv", out=folder / "out.csv")
 
 
-def identify_from(write, suffix, example, folder):
-    path, out = folder / f"in{suffix}", folder / "out"
-    write(example, path)
+def identify_from(example, folder):
+    path, out = folder / "in.csv", folder / "out"
+    write_csv(example, path)
     words = ("identify", URDF, path, "--validate", path, "--out", out)
     result = out / "result.json"
     if obey(*words) == 1 and result.exists():  # judged to be wrong: said, and no URDF
@@ -153,9 +153,7 @@ def spoilt(draw, name):
         at, length = draw(st.integers(0, len(content))), draw(st.integers(0, 64))
         # headers and indices stand at the ends of a file
         at = draw(st.sampled_from([at, at % 256, max(len(content) - at % 256, 0)]))
-        match draw(
-            st.sampled_from(["overwrite", "overwrite", "insert", "delete", "cut", "repeat"])
-        ):
+        match draw(any_of("overwrite overwrite insert delete cut repeat")):
             case "overwrite":
                 part = draw(new)
                 content[at : at + len(part)] = part
@@ -193,7 +191,7 @@ def columns(draw, rows=None, numbers=numbers):
     table = {name: good[:, k].copy() for k, name in enumerate(COLUMNS)}
     for _ in range(draw(st.integers(0, 4))):
         name = draw(st.sampled_from(sorted(table)))
-        action = draw(st.sampled_from(["one", "all", "scale", "jump", "shift", "drop", "rename"]))
+        action = draw(any_of("one all scale jump shift drop rename"))
         if action == "drop" and len(table) > 1:
             del table[name]
         elif action == "rename":
@@ -220,20 +218,15 @@ def _spoil(values, action, row, number):
 
 #: Numbers that a reader lets through.
 MILD = [0.0, -1.0, 1e-300, 1e-30, 1e-9, 1e-3, 0.1, 0.5, 2.0, np.pi, 10.0, 1e3, 1e6, 1e9, 1e20, 1e29]
-names = st.sampled_from(
-    [
-        "", " ", "t", "time", "q_", "_", "q_joint_1", "tau_joint_3", "nan", "x" * 300, "time,t",
-        '"', "é", "\U0001f916", "a/b", "#x", "current_joint_1",
-    ]
-)  # fmt: skip
+names = st.sampled_from([
+    "", " ", "t", "time", "q_", "_", "q_joint_1", "tau_joint_3", "nan", "x" * 300, "time,t", '"',
+    "é", "\U0001f916", "a/b", "#x", "current_joint_1",
+])  # fmt: skip
 
 
 def write_csv(table, path):
-    rows = [
-        ",".join(table),
-        *(",".join(map(repr, map(float, row))) for row in zip(*table.values(), strict=True)),
-    ]
-    path.write_text("\n".join(rows), encoding="utf-8")
+    rows = [",".join(repr(float(x)) for x in row) for row in zip(*table.values(), strict=True)]
+    path.write_text("\n".join([",".join(table), *rows]), encoding="utf-8")
 
 
 def write_npz(table, path):
@@ -258,31 +251,16 @@ def write_parquet(table, path):
 
 #: What stands where an array of numbers should.
 ODD = [
-    np.array(["a", "b"]),
-    np.array(b"\xff\xfe"),
-    np.array([b"\xff", b"joint_1"]),
-    np.array(1.0),
-    np.zeros((2, 3, 4)),
-    np.zeros((0, 3)),
-    np.zeros(0),
-    np.array([1j, 2j]),
-    np.array([True, False]),
-    np.zeros(3, dtype=[("a", "f8"), ("b", "U3")]),
-    np.array([0, 2**63], dtype=np.uint64),
-    np.array(["2020-01-01"], dtype="datetime64[D]"),
-    np.full((60, 5), 1e308),
-    np.zeros((60, 1)),
-    np.array(["joint_1", "joint_2"]),
-    np.array(["joint_1"] * 3),
-    np.arange(60.0).reshape(1, 60),
-]
+    np.array(["a", "b"]), np.array(b"\xff\xfe"), np.array([b"\xff", b"joint_1"]), np.array(1.0),
+    np.zeros((2, 3, 4)), np.zeros((0, 3)), np.zeros(0), np.array([1j, 2j]), np.array([True, False]),
+    np.zeros(3, dtype=[("a", "f8"), ("b", "U3")]), np.array([0, 2**63], dtype=np.uint64),
+    np.array(["2020-01-01"], dtype="datetime64[D]"), np.full((60, 5), 1e308), np.zeros((60, 1)),
+    np.array(["joint_1", "joint_2"]), np.array(["joint_1"] * 3), np.arange(60.0).reshape(1, 60),
+]  # fmt: skip
 odd = st.sampled_from(ODD)
-keys = st.sampled_from(
-    ["time", "t", "q", "tau", "joints", "joint_names", "dq", "a/time", "a/q", "#"]
-)
-shapes = st.lists(
-    st.sampled_from([0, 1, 2, 60, 10**6, 10**9, 10**12, 2**31 - 1, 2**40, -1]), max_size=4
-)
+keys = any_of("time t q tau joints joint_names dq a/time a/q #")
+sizes = st.sampled_from([0, 1, 2, 60, 10**6, 10**9, 10**12, 2**31 - 1, 2**40, -1])
+shapes = st.lists(sizes, max_size=4)
 arrays = st.dictionaries(keys, odd, max_size=6)
 
 
@@ -292,20 +270,11 @@ def headers(draw):
     made = {}
     for name in draw(st.lists(keys, min_size=1, max_size=4, unique=True)):
         shape = tuple(draw(shapes))
-        kind = draw(
-            st.sampled_from(["<f8", "|O", "<U9", ">i2", "<M8[s]", "nonsense", "<f16", "|V0"])
-        )
-        text = draw(
-            st.sampled_from(
-                [
-                    repr({"descr": kind, "fortran_order": draw(st.booleans()), "shape": shape}),
-                    repr({"descr": kind, "shape": shape}),
-                    "{" * 200,
-                    "__import__('os')",
-                    "",
-                ]
-            )
-        )
+        kind = draw(any_of("<f8 |O <U9 >i2 <M8[s] nonsense <f16 |V0"))
+        lacking = {"descr": kind, "shape": shape}
+        whole = lacking | {"fortran_order": draw(st.booleans())}
+        texts = [repr(whole), repr(lacking), "{" * 200, "__import__('os')", ""]
+        text = draw(st.sampled_from(texts))
         version = draw(st.sampled_from([b"\1\0", b"\2\0", b"\3\0", b"\x09\0"]))
         size = len(text).to_bytes(2 if version == b"\1\0" else 4, "little")
         made[name] = b"\x93NUMPY" + version + size + text.encode() + draw(st.binary(max_size=64))
@@ -328,21 +297,15 @@ def write_odd_hdf5(content, path):
             file.create_dataset(name, data=values.astype(object) if is_text else values, dtype=kind)
         for name, shape in claimed.items():
             if name not in file:
-                file.create_dataset(
-                    name, shape=tuple(abs(x) for x in shape), dtype="f8", chunks=True
-                )
+                file.create_dataset(name, tuple(map(abs, shape)), dtype="f8", chunks=True)
         for name, link in links.items():
             if name not in file:
                 file[name] = link if link is not None else file["/"]
 
 
-links = st.dictionaries(
-    st.sampled_from(["a", "b", "time", "q"]),
-    st.sampled_from(
-        [None, h5py.SoftLink("/none"), h5py.SoftLink("/a"), h5py.ExternalLink("no.h5", "/x")]
-    ),
-    max_size=3,
-)
+targets = [None, h5py.SoftLink("/none"), h5py.SoftLink("/a"), h5py.ExternalLink("no.h5", "/x")]
+link_names = st.sampled_from(["a", "b", "time", "q"])
+links = st.dictionaries(link_names, st.sampled_from(targets), max_size=3)
 odd_hdf5 = st.tuples(arrays, st.dictionaries(keys, shapes, max_size=3), links)
 
 
@@ -354,18 +317,16 @@ def cell_array(items):
     return made
 
 
-cells = st.recursive(
-    odd,
-    lambda inner: (
-        st.lists(inner, max_size=3).map(cell_array) | st.dictionaries(keys, inner, max_size=3)
-    ),
-)
+def _nested(inner):
+    return st.lists(inner, max_size=3).map(cell_array) | st.dictionaries(keys, inner, max_size=3)
+
+
+cells = st.recursive(odd, _nested)
 
 
 def write_odd_mat(content, path):
-    scipy.io.savemat(
-        path, {name.replace("/", "_"): x for name, x in content.items() if name != "#"}
-    )
+    named = {name.replace("/", "_"): x for name, x in content.items() if name != "#"}
+    scipy.io.savemat(path, named)
 
 
 # --- settings ------------------------------------------------------------------------------------
@@ -376,21 +337,25 @@ urdf = "{URDF}"
 log = "fit.csv"
 """
 plain = st.one_of(
-    st.sampled_from(
-        ["", "x", "joint_1", "a\0b", "\U0001f916", "auto", "none", "x" * 3000, "$X", "../x"]
-    ),
+    any_of("x joint_1 a\0b \U0001f916 auto none $X ../x") | st.sampled_from(["", "x" * 3000]),
     st.sampled_from([0, 1, -1, 2, 3, 10**9, 10**40, 2**63, 0.5, 1e-320, 1e308, -1e308, 1e30, 1e6]),
-    st.sampled_from([float("nan"), float("inf"), -float("inf"), True, False]),
-    st.integers(),
-    st.floats(),
-    st.text(max_size=8).filter(lambda text: text.isprintable()),
-)
+    st.sampled_from([np.nan, np.inf, -np.inf, True, False]),
+    st.integers(), st.floats(), st.text(max_size=8).filter(lambda text: text.isprintable()),
+)  # fmt: skip
 words = st.sampled_from([*JOINTS, "link_1", "link_2", "torque_scale", "name", "ratios", "x", ""])
 values = st.recursive(
     plain,
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(words, inner, max_size=3),
     max_leaves=6,
 )
+
+
+def broken(draw, text, others):
+    """Return a text, into one of ten of which another one is inserted."""
+    if draw(st.integers(0, 9)):
+        return text
+    at = draw(st.integers(0, len(text)))
+    return text[:at] + draw(st.sampled_from(others)) + text[at:]
 
 
 def _paths(table, prefix=()):
@@ -423,13 +388,11 @@ def jobs(draw):
                 inside = inside[0]
             if isinstance(inside, dict):
                 inside[last] = draw(values)
-    text = "\n".join(f"{json.dumps(key)} = {toml(value)}" for key, value in table.items())
-    if draw(st.integers(0, 9)) == 0:  # no TOML any more
-        at = draw(st.integers(0, len(text)))
-        text = (
-            text[:at] + draw(st.sampled_from(["[" * 3000, "=", '"', "\0", "1" * 5000])) + text[at:]
-        )
-    return text
+    return broken(draw, toml_file(table), ["[" * 3000, "=", '"', "\0", "1" * 5000])
+
+
+def toml_file(table):
+    return "\n".join(f"{json.dumps(key)} = {toml(value)}" for key, value in table.items())
 
 
 def toml(value):
@@ -453,22 +416,16 @@ def run_job_file(text, folder):
     obey("identify", path, "--out", out, out=out)
 
 
-flags = st.sampled_from(
-    [
-        "--rate", "--cutoff", "--friction", "--joints", "--lock", "--gain", "--ignore",
-        "--estimator", "--time-unit", "--angle-unit", "--topic", "--effort", "--stamp",
-        "--workers", "--json",
-    ]
-)  # fmt: skip
-arguments = st.sampled_from(
-    [
-        "", "x", "0", "-1", "1", "nan", "inf", "1e308", "1e-308", "99999", "false", "joint_1=nan",
-        "joint_1=1e308", "joint_1", "joint_1,joint_1", "=", ",", "1_0", "consistent", "wls", "ms",
-        "deg", "٣", "a=b=c",
-    ]
-)  # fmt: skip
+flags = any_of(
+    "--rate --cutoff --friction --joints --lock --gain --ignore --estimator --time-unit "
+    "--angle-unit --topic --effort --stamp --workers --json"
+)
+arguments = st.just("") | any_of(
+    "x 0 -1 1 nan inf 1e308 1e-308 99999 false joint_1=nan joint_1=1e308 joint_1 joint_1,joint_1 "
+    "= , 1_0 consistent wls ms deg ٣ a=b=c"
+)
 command_lines = st.tuples(
-    st.sampled_from(["identify", "doctor", "track", "convert", "inspect", "compare", "validate"]),
+    any_of("identify doctor track convert inspect compare validate"),
     st.lists(st.tuples(flags, arguments), min_size=1, max_size=3),
 )
 
@@ -477,11 +434,7 @@ def run_flags(example, folder):
     command, given = example
     path, out = folder / "fit.csv", folder / "out"
     write_log(good_log(200), path)
-    flat = [
-        word
-        for flag, argument in given
-        for word in ((flag,) if flag == "--json" else (flag, argument))
-    ]
+    flat = [word for pair in given for word in pair[: 1 if pair[0] == "--json" else 2]]
     own = {"convert": [path, folder / "out.csv"]}.get(command, [URDF, path])
     written = ["--out", out] if command in ("identify", "track") else []
     obey(command, *own, *written, *flat, out=out)
@@ -502,15 +455,11 @@ def good_result():
 def places(value, path=()):
     """Yield the path of every value inside a value."""
     yield path
-    pairs = (
-        value.items()
-        if isinstance(value, dict)
-        else enumerate(value)
-        if isinstance(value, list)
-        else ()
-    )
-    for key, inner in pairs:
-        yield from places(inner, (*path, key))
+    if isinstance(value, list):
+        value = dict(enumerate(value))
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from places(inner, (*path, key))
 
 
 @cache
@@ -521,9 +470,8 @@ def result_places():
 
 
 MARKUP = '"><script>alert(1)</script>'
-replacements = values | st.sampled_from(
-    [None, [], {}, MARKUP, "\ud800", [MARKUP], {MARKUP: MARKUP}]
-)
+ODD_JSON = [None, [], {}, MARKUP, "\ud800", [MARKUP], {MARKUP: MARKUP}]
+replacements = values | st.sampled_from(ODD_JSON)
 
 
 def edited(content, given):
@@ -557,80 +505,52 @@ def results(draw):
         for _ in range(draw(st.integers(1, 3)))
     ]
     text = json.dumps(edited(json.loads(good_result()[1]), given))
-    if draw(st.integers(0, 9)) == 0:
-        at = draw(st.integers(0, len(text)))
-        text = (
-            text[:at] + draw(st.sampled_from(["[" * 5000, "", "\0", "9" * 5000, "é"])) + text[at:]
-        )
-    return text
+    return broken(draw, text, ["[" * 5000, "", "\0", "9" * 5000, "é"])
 
 
 def run_result(text, folder):
     good, _ = good_result()
-    path, page = folder / "result.json", folder / "page.html"
+    path, page, replay = (folder / x for x in ("result.json", "page.html", "replay.html"))
     path.write_text(text, encoding="utf-8")
     for name in ("planar_2r.identified.urdf", "planar_2r.identified.drive.json"):
         (folder / name).write_bytes((good / name).read_bytes())
     obey("validate", path, good / "fit.csv")
     obey("compare", path, good / "result.json", "--out", page, out=page)
     obey("compare", good / "result.json", path, "--json")
-    obey(
-        "replay",
-        URDF,
-        good / "fit.csv",
-        path,
-        "--html",
-        folder / "replay.html",
-        out=folder / "replay.html",
-    )
-    for made in (page, folder / "replay.html"):
+    obey("replay", URDF, good / "fit.csv", path, "--html", replay, out=replay)
+    for made in (page, replay):
         if made.exists():
             assert "<script>alert" not in made.read_text(encoding="utf-8"), "markup is not escaped"
 
 
 # --- all of them ---------------------------------------------------------------------------------
 
-READERS = {
-    ".csv": write_csv,
-    ".npz": write_npz,
-    ".mat": write_mat,
-    ".h5": write_hdf5,
-    ".parquet": write_parquet,
-}
-FILES = [
-    "log.csv", "log.parquet", "log.npz", "plain.npz", "log.mat", "plain.mat", "log.h5",
-    "plain.h5", "log.mcap", "log.bag", "log.db3",
-]  # fmt: skip
+READERS = {".csv": write_csv, ".npz": write_npz, ".mat": write_mat, ".h5": write_hdf5,
+           ".parquet": write_parquet}  # fmt: skip
+FILES = [*(f"log{x}" for x in (*READERS, ".mcap", ".bag", ".db3")),
+         "plain.npz", "plain.mat", "plain.h5"]  # fmt: skip
+
+
+def logs_of(write, suffix):
+    return (), partial(read_log_file, write, suffix)
+
 
 #: By name: a strategy of examples, and what is done with one in an empty folder.
 KINDS = {
     **{
-        f"bytes of {name}": (
-            spoilt,
-            (name,),
-            partial(read_log_file, write_bytes, Path(name).suffix),
-        )
+        f"bytes of {name}": (spoilt, (name,), logs_of(write_bytes, Path(name).suffix)[1])
         for name in FILES
     },
-    **{
-        f"values in {suffix}": (columns, (), partial(read_log_file, write, suffix))
-        for suffix, write in READERS.items()
-    },
-    "headers in .npz": (headers, (), partial(read_log_file, write_members, ".npz")),
-    "arrays in .npz": (lambda: arrays, (), partial(read_log_file, write_npz, ".npz")),
-    "structure of .h5": (lambda: odd_hdf5, (), partial(read_log_file, write_odd_hdf5, ".h5")),
+    **{f"values in {suffix}": (columns, *logs_of(x, suffix)) for suffix, x in READERS.items()},
+    "headers in .npz": (headers, *logs_of(write_members, ".npz")),
+    "arrays in .npz": (lambda: arrays, *logs_of(write_npz, ".npz")),
+    "structure of .h5": (lambda: odd_hdf5, *logs_of(write_odd_hdf5, ".h5")),
     "structure of .mat": (
-        lambda: st.dictionaries(keys, cells, max_size=4),
-        (),
-        partial(read_log_file, write_odd_mat, ".mat"),
+        lambda: st.dictionaries(keys, cells, max_size=4), *logs_of(write_odd_mat, ".mat")
     ),
-    "values, identified": (
-        columns,
-        (300, st.sampled_from(MILD)),
-        partial(identify_from, write_csv, ".csv"),
-    ),
+    "values, identified": (columns, (300, st.sampled_from(MILD)), identify_from),
     "job file": (jobs, (), run_job_file),
     "flags": (lambda: command_lines, (), run_flags),
     "result.json": (results, (), run_result),
     "URDF": (urdf_inputs, (), run_urdf),
-}
+}  # fmt: skip

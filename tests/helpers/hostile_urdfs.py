@@ -145,12 +145,24 @@ FILES: dict[str, bytes | str] = {
 
 # --- whole robots --------------------------------------------------------------------------------
 
+SHAPES = (
+    ("box", {"size": "0.1 0.2 0.3"}), ("sphere", {"radius": "0.1"}), ("box", {}), ("capsule", {}),
+    ("cylinder", {"radius": "0.1", "length": "1"}),
+    ("mesh", {"filename": "good.stl", "scale": "1 1 1"}),
+)  # fmt: skip
+
+
 NUMBERS = (
     "xyz", "rpy", "value", "ixx", "ixy", "ixz", "iyy", "iyz", "izz", "lower", "upper", "velocity",
     "effort", "damping", "friction", "multiplier", "offset", "size", "radius", "length", "scale",
     "rgba",
 )  # fmt: skip
 VECTORS = ("xyz", "rpy", "size", "scale", "rgba")
+
+
+def any_of(words):
+    """Return a strategy of the words of a text."""
+    return st.sampled_from(words.split())
 
 
 @st.composite
@@ -163,32 +175,23 @@ def robots(draw) -> ET.Element:
         if draw(st.integers(0, 3)):
             inertial = ET.SubElement(link, "inertial")
             ET.SubElement(inertial, "origin", xyz="0.1 0 0.02", rpy="0 0.3 0")
-            ET.SubElement(
-                inertial, "mass", value=draw(st.sampled_from(["1", "2.5", "0", "1e-9", "1e-15"]))
-            )
-            ET.SubElement(
-                inertial, "inertia", ixx="0.1", ixy="0", ixz="0", iyy="0.1", iyz="0", izz="0.12"
-            )
+            mass = draw(st.sampled_from(["1", "2.5", "0", "1e-9", "1e-15"]))
+            ET.SubElement(inertial, "mass", value=mass)
+            moments = {
+                "ixx": "0.1",
+                "ixy": "0",
+                "ixz": "0",
+                "iyy": "0.1",
+                "iyz": "0",
+                "izz": "0.12",
+            }
+            ET.SubElement(inertial, "inertia", moments)
         for tag in draw(st.lists(st.sampled_from(["visual", "collision"]), max_size=2)):
             geometry = ET.SubElement(ET.SubElement(link, tag), "geometry")
-            kind, about = draw(
-                st.sampled_from(
-                    [
-                        ("box", {"size": "0.1 0.2 0.3"}),
-                        ("sphere", {"radius": "0.1"}),
-                        ("box", {}),
-                        ("capsule", {}),
-                        ("cylinder", {"radius": "0.1", "length": "1"}),
-                        ("mesh", {"filename": "good.stl", "scale": "1 1 1"}),
-                    ]
-                )
-            )
-            ET.SubElement(geometry, kind, about)
+            ET.SubElement(geometry, *draw(st.sampled_from(SHAPES)))
         if k:
-            types = ["revolute", "continuous", "prismatic", "fixed"]
-            joint = ET.SubElement(
-                robot, "joint", name=f"joint_{k}", type=draw(st.sampled_from(types))
-            )
+            kind = draw(st.sampled_from(["revolute", "continuous", "prismatic", "fixed"]))
+            joint = ET.SubElement(robot, "joint", name=f"joint_{k}", type=kind)
             ET.SubElement(joint, "parent", link=f"link_{draw(st.integers(0, k - 1))}")
             ET.SubElement(joint, "child", link=f"link_{k}")
             ET.SubElement(joint, "origin", xyz="0.5 0 0.1", rpy="0 1.5708 0")
@@ -209,9 +212,8 @@ def spoil_number(draw, robot):
     if key in VECTORS:
         words = element.get(key, "").split()
         words[draw(st.integers(0, len(words) - 1))] = draw(number_texts)
-        words = words[: draw(st.sampled_from([9, 9, 9, 2]))] + draw(
-            st.sampled_from([[], [], ["1"]])
-        )
+        words = words[: draw(st.sampled_from([9, 9, 9, 2]))]
+        words += draw(st.sampled_from([[], [], ["1"]]))
         element.set(key, draw(st.sampled_from([" ", " ", "  ", "\t", ","])).join(words))
     else:
         element.set(key, draw(number_texts))
@@ -222,12 +224,8 @@ def spoil_name(draw, robot):
     new = draw(
         st.sampled_from(BAD_NAMES) | st.sampled_from(["link_0", "link_1", "joint_1", "base"])
     )
-    places = [
-        (e, key)
-        for e in robot.iter()
-        for key in ("name", "link", "joint", "type")
-        if key in e.attrib
-    ]
+    keys = ("name", "link", "joint", "type")
+    places = [(e, key) for e in robot.iter() for key in keys if key in e.attrib]
     element, key = draw(st.sampled_from(places))
     old = element.get(key)
     for e, k in places if draw(st.booleans()) else [(element, key)]:
@@ -255,20 +253,9 @@ def spoil_tree(draw, robot):
             for _ in range(draw(st.sampled_from([20, 1000]))):
                 child = ET.SubElement(child, child.tag)
         case "extra":
-            tag = draw(
-                st.sampled_from(
-                    [
-                        "gazebo",
-                        "transmission",
-                        "mesh",
-                        "origin",
-                        "safety_controller",
-                        "mimic",
-                        "limit",
-                    ]
-                )
-            )
-            ET.SubElement(child, tag, {"quat_xyzw": "0 0 0 1", "joint": "joint_1"})
+            tags = any_of("gazebo transmission mesh origin safety_controller mimic limit")
+            about = {"quat_xyzw": "0 0 0 1", "joint": "joint_1"}
+            ET.SubElement(child, draw(tags), about)
 
 
 def spoil_mesh(draw, robot):
@@ -286,18 +273,12 @@ def spoil_mesh(draw, robot):
 
 def spoil_bytes(draw, content):
     """Cut, overwrite or re-encode the bytes of a file."""
-    match draw(
-        st.sampled_from(
-            ["cut", "overwrite", "utf-16", "latin-1", "head", "entities", "comment", "empty"]
-        )
-    ):
+    match draw(any_of("cut overwrite utf-16 latin-1 head entities comment empty")):
         case "cut":
             return content[: draw(st.integers(0, len(content)))]
         case "overwrite":
-            at, new = (
-                draw(st.integers(0, len(content) - 1)),
-                draw(st.binary(min_size=1, max_size=8)),
-            )
+            at = draw(st.integers(0, len(content) - 1))
+            new = draw(st.binary(min_size=1, max_size=8))
             return content[:at] + new + content[at + len(new) :]
         case "utf-16":
             return content.decode().encode("utf-16")
@@ -310,29 +291,22 @@ def spoil_bytes(draw, content):
             inner = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 12))
             return f'<!DOCTYPE robot [<!ENTITY a0 "x">{inner}]><robot name="&a11;"/>'.encode()
         case "comment":
-            return content.replace(b"<link", b"<!-- x --><link").replace(
-                b"<joint", b"<?x y?><joint"
-            )
+            content = content.replace(b"<link", b"<!-- x --><link")
+            return content.replace(b"<joint", b"<?x y?><joint")
     return b""
 
 
-positions = st.floats(allow_nan=True, allow_infinity=True) | st.sampled_from(
-    [0.0, 1e308, "x", None, True]
-)
-options = st.fixed_dictionaries(
-    {},
-    optional={
-        "free_flyer": st.booleans(),
-        "mimic": st.sampled_from(["independent", "coupled"]),
-        "snap_angles": st.booleans(),
-        "locked": st.dictionaries(
-            st.sampled_from(["joint_1", "joint_2", "joint_9", ""]), positions, max_size=2
-        ),
-        "gravity": st.lists(st.floats(allow_nan=True), min_size=2, max_size=4)
-        | st.sampled_from([None, "x", (0, 0, 1e308), 9.81]),
-        "joints": st.lists(st.sampled_from(["joint_1", "joint_2", "joint_3", "x"]), max_size=3),
-    },
-)
+positions = st.floats() | st.sampled_from([0.0, 1e308, "x", None, True])
+odd_gravity = st.sampled_from([None, "x", (0, 0, 1e308), 9.81])
+locked_names = st.sampled_from(["joint_1", "joint_2", "joint_9", ""])
+options = st.fixed_dictionaries({}, optional={
+    "free_flyer": st.booleans(),
+    "mimic": st.sampled_from(["independent", "coupled"]),
+    "snap_angles": st.booleans(),
+    "locked": st.dictionaries(locked_names, positions, max_size=2),
+    "gravity": st.lists(st.floats(), min_size=2, max_size=4) | odd_gravity,
+    "joints": st.lists(st.sampled_from(["joint_1", "joint_2", "joint_3", "x"]), max_size=3),
+})  # fmt: skip
 
 
 @st.composite

@@ -9,7 +9,7 @@ import pinocchio as pin
 from robotid.data.base_motion import BaseMotion, ImuFrame, motion_of_imu
 from robotid.data.log import Log
 from robotid.robot.constraints import Contact, frame_id
-from robotid.robot.parameters import pseudo_inertia
+from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 
 _HOLD = 10  # steps during which a torque is held
 _RADIUS = 1e-3  # [m] of the feet: contacts are at the origin of the foot's link, or at its corners
@@ -21,17 +21,9 @@ def spec_of(
 ):  # fmt: skip
     """Return a MuJoCo model of a robot whose base floats, with small spheres as feet on a plane.
 
-    Args:
-        model: The robot; its tree is written as a URDF with a floating joint. Its loops are
-            ``connect`` constraints.
-        feet: Links that touch the ground, or the points of each link that do, shape (k, 3) [m].
-        step: Of MuJoCo [s].
-        armature: Of each joint with a drive [kg m^2].
-        damping: Of each joint with a drive [N m s/rad].
-        friction: Coefficient of the feet.
-        ground: Time constant of the ground [s].
-        springs: Stiffness [N m/rad] and damping [N m s/rad] by passive joint.
-        imu: Placement of an IMU in the base, or None.
+    Feet are links that touch the ground, or the points of each that do, (k, 3) [m]; ground its time
+    constant [s]; springs stiffness and damping by passive joint; imu its placement in the base.
+    Loops of the robot are ``connect`` constraints.
     """
     pin_model, names = model.pin_model, list(model.pin_model.names)
     spec, bodies = mujoco.MjSpec(), {}
@@ -39,7 +31,7 @@ def spec_of(
         parent, place = pin_model.parents[i], pin_model.jointPlacements[i]
         above = spec.worldbody if parent == 0 else bodies[parent]
         inertia = pin_model.inertias[i]
-        xx, xy, yy, xz, yz, zz = inertia.toDynamicParameters()[4:] - _steiner(inertia)
+        (xx, xy, xz), (_, yy, yz), (_, _, zz) = inertia.inertia
         bodies[i] = above.add_body(
             name=names[i], pos=place.translation, quat=_wxyz(place.rotation),
             mass=inertia.mass, ipos=inertia.lever, fullinertia=[xx, yy, zz, xy, xz, yz],
@@ -106,22 +98,8 @@ def _wxyz(rotation):
     return np.roll(pin.Quaternion(rotation).coeffs(), 1)
 
 
-def _steiner(inertia):
-    """Return what the distance of the centre of mass adds to xx, xy, yy, xz, yz and zz."""
-    x, y, z = inertia.lever
-    m = inertia.mass
-    return m * np.array([y * y + z * z, -x * y, x * x + z * z, -x * z, -y * z, x * x + y * y])
-
-
 def multisine(middle, reach, rng, highest=1.2):
-    """Return a motion of joints about a posture, positions from the time, shape (n,) [rad].
-
-    Args:
-        middle: Posture, shape (n,) [rad].
-        reach: Amplitude of the motion, shape (n,) [rad].
-        rng: Source of the motion.
-        highest: Highest frequency [Hz].
-    """
+    """Return a motion of joints about a posture, positions from the time, below a frequency."""
     tones = np.arange(1, 13)
     f = np.linspace(0.1, highest, len(tones))
     phase = rng.uniform(0, 2 * np.pi, (len(middle), len(tones)))
@@ -137,17 +115,7 @@ def multisine(middle, reach, rng, highest=1.2):
 
 
 def recorded(model, feet, middle, reach, rng, *, highest=1.2, **options):
-    """Return the log of a robot whose joints follow multi-sines while its feet are on the ground.
-
-    Args:
-        model: The robot, whose bodies are those of its URDF.
-        feet: As of ``spec_of``.
-        middle: Posture in which it stands, shape (n,) [rad].
-        reach: Amplitude of the motion, shape (n,) [rad].
-        rng: Source of the motion and of noise.
-        highest: Highest frequency of the motion [Hz].
-        options: As of ``followed``.
-    """
+    """Return the log of a robot on the ground whose joints follow multi-sines."""
     motion = multisine(middle, reach, rng, highest)
     return followed(model, feet, motion, rng, **{"posture": middle, **options})
 
@@ -159,41 +127,16 @@ def followed(
 ):  # fmt: skip
     """Return the log of a robot on the ground whose joints follow a motion.
 
-    Args:
-        model: The robot, whose bodies are those of its URDF.
-        feet: As of ``spec_of``.
-        motion: Positions [rad] and torques [N m] of the joints from the time, from -1 s on; those
-            of passive joints have no effect.
-        rng: Source of noise.
-        posture: Positions at -1 s, shape (n,) [rad], or (7 + n,) with the pose of the base.
-        duration: Length [s].
-        rate: Rows per second [Hz].
-        step: Of MuJoCo [s].
-        kp: Gain of the position [N m/rad].
-        kd: Gain of the speed [N m s/rad].
-        torque: Standard deviation of the logged torques [N m].
-        bits: Of the joints' encoders, per turn.
-        armature: Of each joint [kg m^2].
-        damping: Of each joint [N m s/rad].
-        height: Of the base at the start [m].
-        force: Whether the feet's forces are logged, in the world's axes.
-        ground: Time constant of the ground [s].
-        gantry: The wrench that holds the base at its origin, with the axes of the world, from the
-            time, its pose (7,) and its speeds (6,); it is logged.
-        springs, friction: As of ``spec_of``.
-        imu: Placement of an IMU in the base, whose filtered values are logged; or None.
+    The motion gives positions [rad] and torques [N m] from the time, from -1 s on; posture is that
+    at -1 s, (n,) or (7 + n,) with the pose of the base, whose height [m] can be given. Torque is
+    the noise of the logged torques, bits those of the encoders; force tells whether forces of the
+    feet are logged in the world's axes. A gantry holds the base: its wrench at the origin from the
+    time, the pose (7,) and the speeds (6,) is logged, as are filtered values of an imu.
     """
     mj = spec_of(
-        model,
-        feet,
-        step=step,
-        armature=armature,
-        damping=damping,
-        ground=ground,
-        springs=springs,
-        friction=friction,
-        imu=imu,
-    )
+        model, feet, step=step, armature=armature, damping=damping, ground=ground, springs=springs,
+        friction=friction, imu=imu,
+    )  # fmt: skip
     data, feet = mujoco.MjData(mj), _points(feet)
     joints = [mj.joint(name) for name in model.joints]
     qpos = np.array([joint.qposadr[0] for joint in joints])
@@ -279,14 +222,11 @@ def _logged(model, feet, mj, qpos, rows, rng, torque, bits, force):
     tau = rows[:, first : first + n] + torque * rng.standard_normal((len(t), n))
     flags, forces = np.split(rows[:, first + n + 6 :], [len(feet)], axis=1)
     flags, forces = flags > 0, forces.reshape(len(t), -1, 3)
-    wrenches = {}
-    if force:
-        parts = ("fx", "fy", "fz")
-        wrenches = {
-            f"{part} {foot}": forces[:, i, k]
-            for i, foot in enumerate(feet)
-            for k, part in enumerate(parts)
-        }
+    wrenches = {
+        f"{part} {foot}": forces[:, i, k]
+        for i, foot in enumerate(feet if force else ())
+        for k, part in enumerate(("fx", "fy", "fz"))
+    }
     return Log(
         t, q, tau, model.joints, base=BaseMotion(pose),
         contacts={foot: flags[:, i] for i, foot in enumerate(feet)}, wrenches=wrenches,
@@ -296,13 +236,8 @@ def _logged(model, feet, mj, qpos, rows, rng, torque, bits, force):
 def with_other_bodies(model, rng, size=0.08):
     """Return a robot whose bodies differ from those of a URDF, physically consistent.
 
-    Masses differ by up to 25 %. Each body is stretched and sheared, and its mass is displaced.
-
-    Args:
-        model: The robot.
-        rng: Source of the differences.
-        size: Of the stretch, and of the displacement relative to the size of the body: the
-            distance of its centre of mass plus its radius of gyration.
+    Masses differ by up to 25 %. Each body is stretched and sheared, and its mass displaced, by a
+    share of the distance of its centre of mass plus its radius of gyration.
     """
     pi = model.standard_parameters()[: model.layout.n_inertial]
     bodies = []
@@ -311,10 +246,5 @@ def with_other_bodies(model, rng, size=0.08):
         mass, centre = J[3, 3], J[:3, 3] / J[3, 3]
         A[:3, 3] *= np.linalg.norm(centre) + np.sqrt(np.trace(J[:3, :3]) / mass)
         A[3, 3] = np.sqrt(rng.uniform(0.75, 1.25))
-        J = A @ J @ A.T
-        trace = np.trace(J[:3, :3]) * np.eye(3) - J[:3, :3]
-        bodies.append(
-            [J[3, 3], *J[:3, 3], trace[0, 0], trace[0, 1], trace[1, 1], trace[0, 2], trace[1, 2],
-             trace[2, 2]]
-        )  # fmt: skip
+        bodies.append(inertial_from_pseudo_inertia(A @ J @ A.T))
     return model.with_parameters(np.concatenate(bodies))

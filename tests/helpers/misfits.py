@@ -104,18 +104,9 @@ def log_with(
 ):  # fmt: skip
     """Return a log of a robot like the model whose drives are viscous and Coulomb, but for one.
 
-    Args:
-        model: The robot.
-        seed: Of the robot; with ``part`` that of the motion and the noise.
-        effect: Name of what joint ``joint`` has beside; None for nothing.
-        joint: Which joint.
-        duration: Length [s].
-        rate: Rate [Hz].
-        noise: Of each torque, share of its typical size.
-        memory: Correlation time of that noise [samples].
-        coupling: Ratios of a drive that turns with several joints, or None.
-        part: Which of several logs.
-        size: Of the effect.
+    The seed makes the robot, with ``part`` also motion and noise; noise is the share of each
+    torque's typical size, memory its correlation time [samples]; coupling has ratios of a drive
+    that turns with several joints.
     """
     rng = np.random.default_rng([seed, part])
     truth = model if coupling is None else model.from_urdf(

@@ -37,20 +37,13 @@ ROBOTS = {
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """A robot whose drives are known.
+    """A robot whose drives are known."""
 
-    Attributes:
-        model: The robot as its URDF says, whose bodies are the truth.
-        drives: Its drives.
-        middle, reach: Of the commands, shape (n,) [rad].
-        bodies: Their inertial parameters, shape (10 n,); those of the URDF if None.
-    """
-
-    model: RobotModel
+    model: RobotModel  # as its URDF says
     drives: tuple[CommandedDrive, ...]
-    middle: np.ndarray
-    reach: np.ndarray
-    bodies: np.ndarray | None = None
+    middle: np.ndarray  # (n,), of the commands [rad]
+    reach: np.ndarray  # (n,) [rad]
+    bodies: np.ndarray | None = None  # (10 n,), true inertial parameters; None: of the URDF
 
     @property
     def truth(self) -> dict[str, float]:
@@ -64,13 +57,7 @@ class Plant:
 
 
 def plant(name, rng, **changes):
-    """Return one of these robots with drives drawn about their typical values.
-
-    Args:
-        name: Which one.
-        rng: Source of the drives.
-        changes: Figures of every drive that are stated instead, as ``delay=0.01``.
-    """
+    """Return one of these robots with drives drawn about their typical values, some changed."""
     file, joints, middle, reach, scale = ROBOTS[name]
     path = URDF / file
     urdf = path if path.is_file() else example_urdf(file)
@@ -93,16 +80,8 @@ def recorded(
 ):  # fmt: skip
     """Return the log of a multi-sine that a plant was commanded to follow, and its truth.
 
-    Args:
-        plant: The robot.
-        rng: Source of the motion and of the encoders' noise.
-        duration: Length [s].
-        rate: Rows per second, each a command that is held until the next [Hz].
-        noise: Standard deviation of the encoders [rad].
-        torque: Standard deviation of the drives' logged torques [N m]; None: none are logged.
-        speed: Standard deviation of the logged speeds [rad/s]; None: none are logged.
-        highest: Highest tone of the commands [Hz].
-        step: Of MuJoCo, at most [s]; forces that are logged are half a step early.
+    Each row has a command that is held until the next. Noise, torque and speed are standard
+    deviations of what is logged; None: it is not. Forces that are logged are half a step early.
     """
     t = np.arange(round(duration * rate)) / rate
     q_ref = multisine(t, plant.middle, plant.reach, rng, highest=highest)
@@ -162,14 +141,8 @@ def loaded(plant, rate, step=_STEP, *, as_exported=False):
 def held(plant, q_ref, rate, clock, settles=_SETTLES):
     """Return positions under a controller that holds its torque between ticks, shape (N, n).
 
-    Motors get what it makes of MuJoCo's own position and speed; Runge-Kutta's steps between.
-
-    Args:
-        plant: The robot, whose drives have no delay.
-        q_ref: Commands, shape (N, n) [rad].
-        rate: Commands per second [Hz].
-        clock: Ticks per second, the first with the first command [Hz].
-        settles: How long the first command is held before [s].
+    Motors, without delay, get what it makes of MuJoCo's own position and speed; Runge-Kutta's steps
+    between. Commands (N, n) come at a rate, ticks at that of a clock [Hz], the first together.
     """
     robot = loaded(plant, rate, as_exported=True)
     robot.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
@@ -195,11 +168,7 @@ def followed(robot, q_ref, rate, settles=_SETTLES):
 def rolled_out(robot, q_ref, rate, settles=_SETTLES):
     """Return positions, forces and speeds of MuJoCo's robot, (N, n), at times of held commands.
 
-    Args:
-        robot: MuJoCo's model; its actuators are in the order of the commands.
-        q_ref: Commands, shape (N, n) [rad].
-        rate: Commands per second [Hz].
-        settles: How long the first command is held before [s].
+    Its actuators are in the order of the commands, the first of which is held until it settles [s].
     """
     held = round(1.0 / rate / robot.opt.timestep)
     at = robot.jnt_qposadr[robot.actuator_trnid[:, 0]]
@@ -228,17 +197,8 @@ def torque_log(
 ):
     """Return the log of a plant's positions and of the torques that move it, without commands.
 
-    The loop runs so much faster than the log is written that its torque is smooth between rows.
-
-    Args:
-        plant: The robot, whose controller is not in the log.
-        rng: Source of the motion and of the noise.
-        duration: Length [s].
-        rate: Rows per second of the log [Hz].
-        fine: Commands per second of the loop [Hz].
-        noise: Standard deviation of the encoders [rad].
-        torque: Standard deviation of the logged torques [N m].
-        relative: The same over their typical size [-].
+    The loop runs so much faster (fine) than the log is written (rate) that its torque is smooth
+    between rows. Noise of encoders, of torques, and of torques relative to their typical size.
     """
     t = np.arange(round(duration * fine)) / fine
     q_ref = multisine(t, plant.middle, plant.reach, rng)

@@ -11,15 +11,8 @@ from robotid.robot.constraints import frame_id
 def stand(model, middle, height, rng, *, parts=4, length=3.0, rate=100.0, size=1.0):
     """Return a motion whose base sways; a leg is in the air in each part but the first.
 
-    Args:
-        model: The robot; its joints are in order of its contacts, as many at each leg.
-        middle: Posture in which it stands, shape (n,) [rad].
-        height: Of the base [m].
-        rng: Source of the motion.
-        parts: Number of parts.
-        length: Of each part [s].
-        rate: Samples per second [Hz].
-        size: Factor on the motion of the base: 1 is a few centimetres.
+    Joints of the model are in order of its contacts, as many at each leg; it stands in the middle
+    posture. Size is a factor on the motion of the base: 1 is a few centimetres.
     """
     t = np.arange(round(parts * length * rate) + 1) / rate
     part = np.minimum((t / length).astype(int), parts - 1)
@@ -29,10 +22,8 @@ def stand(model, middle, height, rng, *, parts=4, length=3.0, rate=100.0, size=1
     touching = np.ones((len(t), feet), dtype=bool)
     for p in range(parts):
         k, tones = part == p, np.arange(1, 4)[:, None, None]
-        phase, size_of = (
-            rng.uniform(0, 2 * np.pi, (3, 6 + n, 1)),
-            rng.standard_normal((3, 6 + n, 1)),
-        )
+        phase = rng.uniform(0, 2 * np.pi, (3, 6 + n, 1))
+        size_of = rng.standard_normal((3, 6 + n, 1))
         wave = np.sum(size_of * np.sin(2 * np.pi * tones * s[k] + phase), axis=0).T
         wave *= np.sin(np.pi * s[k, None]) ** 3  # at rest at both ends
         pose[k] = size * wave[:, :6] * ([0.01] * 3 + [0.07] * 3)

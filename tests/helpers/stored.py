@@ -335,12 +335,7 @@ def numbers_of(packed):
 def differences(stored, found, at="", *, times=1.0, room=0.0):
     """Yield where two values differ, and how.
 
-    Args:
-        stored: As the file has it.
-        found: As it is now.
-        at: Where they stand.
-        times: How often the typical tolerance is allowed.
-        room: What may differ whatever the size.
+    Typical tolerances are allowed ``times``, and a difference of ``room`` whatever the size.
     """
     if isinstance(stored, dict) and isinstance(found, dict):
         beside = room or times * _spread(stored)

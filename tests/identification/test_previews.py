@@ -27,7 +27,7 @@ from robotid.dynamics.factors import Factors, compress
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.torque import joint_torque_regressor, trajectory_regressor
 from robotid.dynamics.used_rows import base_problem
-from robotid.estimation.estimators.segments import scatter
+from robotid.estimation.estimators.estimator import scatter
 from robotid.estimation.fitting.survey import hold_log
 from robotid.output.files.entries import build_preview
 

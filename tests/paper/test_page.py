@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.pages import chart, charts
 
-from robotid.paper import page
+from robotid.paper import run as page
 from robotid.paper.study import MODELS, PaperSettings, study_model
 
 
@@ -22,7 +22,7 @@ def test_figure_4_is_the_control_of_its_joint_by_iterations(studies):
     html = page._control_figures(studies)
     for study in studies:
         for joint in (0, 1):
-            u = study.history.torques[:, :, 0, joint]
+            u = study.history.torques[:, :, joint]
             title = f"Figure 4({'ab'[joint]}). {study.name}: control u{joint + 1} (21)"
             upper, lower = [what for what in charts(html) if what["title"].startswith(title)]
             close(upper["x"], 0.02 * np.arange(100))

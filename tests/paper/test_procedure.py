@@ -1,35 +1,35 @@
-"""The closed-loop procedure (14)-(25), on the paper's arm and on a UR5 under gravity."""
+"""The equations and the procedure (11)-(25), on the paper's arm and on a UR5 under gravity."""
 
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
+import pinocchio as pin
 import pytest
-from helpers.base_dynamics import BaseDynamics
-from scipy.integrate import solve_ivp
+from helpers.synthetic import truth
 
-from robotid.base.exceptions import SettingsError
+from robotid.base.exceptions import RankDeficientError, SettingsError
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.motions import ProgramMotion
 from robotid.dynamics.simulation.simulator import RobotPlant
+from robotid.dynamics.torque import joint_torque_regressor
 from robotid.paper import planar_2r
-from robotid.paper.equations import (
-    Bounds,
-    LinearPlant,
-    PlanarDynamics,
-    mass_matrix,
-    smallest_eigenvalue,
-)
 from robotid.paper.procedure import (
     Influences,
+    LinearDynamics,
     LoopSettings,
-    _Loop,
+    one_shot,
+    proximity,
+    recursive_update,
+    rk4,
     run_procedure,
+    smallest_eigenvalue,
 )
+from robotid.paper.study import planar_dynamics
 from robotid.robot.model import RobotModel
 
 P4 = planar_2r.parameters(planar_2r.PAPER_LINKS)
-ARM = PlanarDynamics("corrected")
-PLANT = LinearPlant(ARM, P4)
+ARM = planar_dynamics()
+PLANT = partial(ARM.acceleration, P=P4)
 MOTION = ProgramMotion(np.array([1.0, 1.5]), 2.0)
 DEGREE = np.array([np.pi / 180, 0.0])
 
@@ -42,13 +42,15 @@ def run(P0=P4 / 2, **options):
     return run_procedure(ARM, PLANT, MOTION, np.atleast_2d(P0), **options)
 
 
-@pytest.fixture(scope="module")
-def gentle_ur5(ur5):
-    """A UR5 without drives, its base dynamics and the motion it makes."""
-    model = RobotModel.from_urdf(ur5.tree.path, terms=())
-    dynamics = BaseDynamics(model, structural_mapping(model))
-    reach = np.array([1.0, -0.8, 1.2, 0.9, -1.1, 0.7])
-    return model, dynamics, ProgramMotion(reach, 2.0, np.full(6, 0.2))
+def base_dynamics(model):
+    """Return a robot as the procedure takes it, linear in its base parameters."""
+    mapping = structural_mapping(model)
+
+    def regressor(q, v, a):
+        W = joint_torque_regressor(model, q, v, a)  # (R n, p)
+        return W[:, mapping.independent].reshape(*q.shape, -1)
+
+    return LinearDynamics(mapping.base_names, regressor)
 
 
 # --- with the true parameters -----------------------------------------------------------------
@@ -86,13 +88,15 @@ def test_with_22_to_the_letter_prx_is_zero_and_the_estimate_never_moves():
     assert ours.relative_error(P4)[1, 0] < 0.4
 
 
-def test_a_ur5_under_gravity_tracks_with_its_true_base_parameters(gentle_ur5):
-    model, dynamics, motion = gentle_ur5
+def test_a_ur5_under_gravity_tracks_with_its_true_base_parameters(ur5):
+    model = RobotModel.from_urdf(ur5.tree.path, terms=())
     pi = model.standard_parameters()
-    beta = dynamics.mapping.to_base(pi)
+    beta = structural_mapping(model).to_base(pi)
+    motion = ProgramMotion(np.array([1.0, -0.8, 1.2, 0.9, -1.1, 0.7]), 2.0, np.full(6, 0.2))
     history = run_procedure(
-        dynamics, RobotPlant(model, pi), motion, beta[None], settings=short(1, updates=200)
-    )
+        base_dynamics(model), RobotPlant(model, pi).acceleration, motion, beta[None],
+        settings=short(1, updates=200),
+    )  # fmt: skip
     assert history.prx.max() < 1e-9  # [N m / s^2], of 1e3 and more for wrong parameters
     assert history.tracking.max() < 0.01
 
@@ -103,9 +107,9 @@ def test_a_ur5_under_gravity_tracks_with_its_true_base_parameters(gentle_ur5):
 @cache
 def twelve_iterations(form):
     """Return the courses that begin one degree off the program, and exactly on it."""
-    dynamics, P = PlanarDynamics(form), P4 if form == "corrected" else planar_2r.PAPER_PARAMETERS
+    dynamics, P = planar_dynamics(form), P4 if form == "corrected" else planar_2r.PAPER_PARAMETERS
     return run_procedure(
-        dynamics, LinearPlant(dynamics, P), MOTION, np.tile(P / 2, (2, 1)),
+        dynamics, partial(dynamics.acceleration, P=P), MOTION, np.tile(P / 2, (2, 1)),
         settings=LoopSettings(iterations=12), offset=np.array([DEGREE, 0.0 * DEGREE]),
     )  # fmt: skip
 
@@ -140,9 +144,9 @@ def test_the_error_never_grows_while_the_guarantee_holds(rng):
         ARM, PLANT, motion, guesses, settings=short(6), offset=rng.uniform(-0.1, 0.1, (8, 2))
     )
     q = np.column_stack([np.zeros(73), np.linspace(-np.pi, np.pi, 73)])
-    true = smallest_eigenvalue(mass_matrix(ARM, q, P4))
+    true = smallest_eigenvalue(ARM.mass_matrix(q, P4))
     for P in history.estimates.reshape(-1, 4):
-        assert (smallest_eigenvalue(mass_matrix(ARM, q, P)) <= 2 * true).all()
+        assert (smallest_eigenvalue(ARM.mass_matrix(q, P)) <= 2 * true).all()
     assert (np.diff(history.relative_error(P4), axis=0) < 0).all()
 
 
@@ -155,7 +159,7 @@ def test_the_closed_form_arm_and_its_urdf_are_one_plant(tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_text(planar_2r.urdf_text())
     model = RobotModel.from_urdf(path, terms=())
-    robot = RobotPlant(model, model.standard_parameters())
+    robot = RobotPlant(model, model.standard_parameters()).acceleration
     ours, theirs = (
         run_procedure(ARM, plant, MOTION, P4[None] / 2, settings=short(2, updates=50))
         for plant in (PLANT, robot)
@@ -164,23 +168,6 @@ def test_the_closed_form_arm_and_its_urdf_are_one_plant(tmp_path):
 
 
 # --- bounds, disturbance, noise, friction -----------------------------------------------------
-
-
-@pytest.mark.parametrize("substeps", [1, 3])
-def test_between_updates_the_torque_is_held_and_the_arm_moves_on(substeps, rng):
-    motion = ProgramMotion(np.array([[1.0, 1.5], [0.7, -1.1]]), np.array([2.0, 1.5]))
-    settings = short(1, updates=10, substeps=substeps)
-    loop = _Loop(ARM, PLANT, motion, settings, Influences(), np.tile(P4, (2, 1)), 0.0)
-    q, v, u = rng.uniform(-1, 1, (3, 2, 2)) * np.array([2.0, 3.0, 40.0])[:, None, None]
-    found = np.hstack(loop._advance(q, v, PLANT.acceleration(q, v, u), u))
-    for r, dt in enumerate((0.2, 0.15)):
-
-        def slope(t, x, u=u[[r]]):
-            return np.append(x[2:], PLANT.acceleration(x[None, :2], x[None, 2:], u))
-
-        exact = solve_ivp(slope, (0.0, dt), np.append(q[r], v[r]), rtol=1e-11, atol=1e-12)
-        # of order 4: a third of the step leaves a 243rd of the error, times three
-        np.testing.assert_allclose(found[r], exact.y[:, -1], atol=0.1 / substeps**4)
 
 
 def test_noise_makes_the_smallest_samples_dangerous_and_eps2_leaves_them_out():
@@ -205,6 +192,112 @@ def test_an_impossible_guess_is_not_updated_and_a_runaway_is_told():
     np.testing.assert_array_equal(history.estimates[-1, 0], -P4)
     alone = run(settings=short(2), offset=DEGREE)
     np.testing.assert_array_equal(history.estimates[:, 1], alone.estimates[:, 0])
+
+
+# --- the equations ----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def arm(ur5):
+    return base_dynamics(ur5)
+
+
+def states(rng, count, n):
+    return rng.uniform(-np.pi, np.pi, (count, n)), *rng.uniform(-3, 3, (2, count, n))
+
+
+def test_mass_matrix_from_base_parameters_is_pinocchios_crba(arm, ur5, rng):
+    pi = ur5.standard_parameters()
+    q, _, _ = states(rng, 10, 6)
+    data = ur5.pin_model.createData()
+    for D, q_k in zip(arm.mass_matrix(q, structural_mapping(ur5).to_base(pi)), q, strict=True):
+        M = pin.crba(ur5.pin_model, data, q_k)
+        np.testing.assert_allclose(D, np.triu(M) + np.triu(M, 1).T, atol=1e-12)
+
+
+def test_a_linear_plant_moves_as_the_robot_does(arm, ur5, rng):
+    pi = truth(ur5)
+    q, v, u = states(rng, 10, 6)
+    v += 0.5 * np.sign(v)  # away from 0, where the plant's friction is smooth
+    ours = arm.acceleration(q, v, 20 * u, structural_mapping(ur5).to_base(pi))
+    # wrist inertias of 0.1 kg m^2 multiply rounding of 50 N m
+    np.testing.assert_allclose(ours, RobotPlant(ur5, pi).acceleration(q, v, 20 * u), rtol=1e-9)
+
+
+def test_acceleration_solves_the_dynamics(rng):
+    dynamics, P = planar_dynamics("printed"), planar_2r.PAPER_PARAMETERS
+    q, v, u = states(rng, 20, 2)
+    a = dynamics.acceleration(q, v, u, P)
+    np.testing.assert_allclose(dynamics.torque(q, v, a, P), u, atol=1e-12)
+
+
+# --- control, proximity, update ---------------------------------------------------------------
+
+
+def test_proximity_is_the_gradient_of_the_criterion(rng):
+    Psi, P, u, h = rng.normal(size=(2, 5)), rng.normal(size=5), rng.normal(size=2), 1e-6
+
+    def J(P):  # (3)
+        return 0.5 * np.sum((u - Psi @ P) ** 2)
+
+    slopes = [(J(P + h * e) - J(P - h * e)) / (2 * h) for e in np.eye(5)]
+    # J is quadratic: central differences are exact but for rounding, 1e-16 / h
+    np.testing.assert_allclose(proximity(Psi, P, u), slopes, atol=1e-8)
+
+
+def test_only_the_corrected_proximity_vanishes_at_the_truth(rng):
+    Psi, P = rng.normal(size=(3, 2, 5)), rng.normal(size=(3, 5))
+    u = np.einsum("rnc,rc->rn", Psi, P)
+    np.testing.assert_allclose(proximity(Psi, P, u), 0.0, atol=1e-14)
+    printed = proximity(Psi, P, u, sign="printed")
+    np.testing.assert_allclose(printed, 2 * np.einsum("rnc,rn->rc", Psi, u), rtol=1e-13)
+    assert np.abs(printed).max() > 1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"is_open": np.array(False)}, "PRX is zero"),
+        ({"eps2": 1e9}, "the sample is small"),
+        ({"sigma": np.array(-0.1)}, "D is not positive definite"),
+    ],
+)
+def test_an_update_is_left_out_where(change, why, rng):
+    P, Psi, eta = rng.normal(size=5), rng.normal(size=(2, 5)), rng.normal(size=2)
+    arguments = {"sigma": np.array(1.0), "is_open": np.array(True), **change}
+    found = recursive_update(P, Psi, eta, **arguments)
+    np.testing.assert_array_equal(found, P, err_msg=why)
+
+
+def test_one_shot_finds_the_truth_from_any_guess(rng):
+    G, P, P_hat = rng.normal(size=(40, 5)), rng.normal(size=5), rng.normal(size=5)
+    # G_* with G P = G_* P^: any matrix, moved along P^ so that the torques agree
+    G_star = rng.normal(size=(40, 5))
+    G_star += np.outer(G @ P - G_star @ P_hat, P_hat) / (P_hat @ P_hat)
+    np.testing.assert_allclose(one_shot(G, G_star, P_hat, "abcde"), P, rtol=1e-12)
+
+
+def test_one_shot_names_what_the_motion_leaves_open(rng):
+    G = rng.normal(size=(40, 4))
+    G[:, 3] = 2 * G[:, 1]
+    with pytest.raises(RankDeficientError, match=r"excite 3 of 4 .* undetermined: b, d\."):
+        one_shot(G, G, np.ones(4), "abcd")
+
+
+def swing(q, v):
+    return -4.0 * q - 0.2 * v
+
+
+def test_its_error_falls_with_the_fourth_power_of_the_step():
+    def end(steps):
+        q, v = np.array([1.0]), np.array([0.0])
+        for _ in range(steps):
+            q, v = rk4(swing, q, v, 2.0 / steps)
+        return float(q[0])
+
+    w = np.sqrt(4.0 - 0.01)
+    exact = np.exp(-0.2) * (np.cos(2 * w) + 0.1 / w * np.sin(2 * w))
+    assert (end(20) - exact) / (end(40) - exact) == pytest.approx(16.0, rel=0.1)
 
 
 # --- errors -----------------------------------------------------------------------------------
@@ -249,7 +342,7 @@ def test_an_iteration_is_its_equations_update_by_update(rng):
     """Two runs of their own duration; each sensor has noise of its own, a bound is met."""
     motion = ProgramMotion(np.array([[1.0, 1.5], [0.7, -1.1]]), np.array([2.0, 1.5]))
     alpha, beta = np.array([20.0, 11.0]), np.array([100.0, 40.0])
-    bounds = Bounds(np.full(4, -30.0), np.array([13.0, 30.0, 30.0, 30.0]))
+    bounds = np.full(4, -30.0), np.array([13.0, 30.0, 30.0, 30.0])
     levels = 0.01 * np.array([1.0, 2.0]), np.full(2, 0.05), np.array([0.7, 0.2])
     drawn = rng.standard_normal((40, 3, 2, 2))
     influences = Influences(
@@ -257,9 +350,10 @@ def test_an_iteration_is_its_equations_update_by_update(rng):
     )
     guesses, offset = np.array([P4 / 2, P4 * 0.8]), np.array([[0.05, -0.4], [0.0, 0.1]])
     settings = short(1, updates=40, alpha=alpha, beta=beta, bounds=bounds)
-    loop = _Loop(ARM, PLANT, motion, settings, influences, guesses, offset)
-    loop.iterate(1, keep_torques=True)
-    P, dt = np.clip(guesses, bounds.lower, bounds.upper), np.array([0.05, 0.0375])
+    history = run_procedure(
+        ARM, PLANT, motion, guesses, settings=settings, offset=offset, influences=influences
+    )
+    P, dt = np.clip(guesses, *bounds), np.array([0.05, 0.0375])
     start = P.copy()
     q, v = motion.evaluate(np.zeros(2))[0] + offset, np.zeros((2, 2))
     largest, distance, torques, met = np.zeros(2), np.zeros(2), [], 0
@@ -271,19 +365,18 @@ def test_an_iteration_is_its_equations_update_by_update(rng):
         Psi = ARM.regressor(q_seen, v_seen, q_star)
         u = np.array([X @ p for X, p in zip(Psi, P, strict=True)])
         applied = 1.1 * u + (k * dt)[:, None]
-        a = PLANT.acceleration(q, v, applied)
+        a = PLANT(q, v, applied)
         a_seen = a + levels[2] * noisy[2]
         G = ARM.regressor(q_seen, v_seen, a_seen)
         prx = [np.abs(X.T @ (X @ p - w)).max() for X, p, w in zip(G, P, u, strict=True)]
         largest = np.maximum(largest, prx)
-        for r, (X, D) in enumerate(zip(Psi, mass_matrix(ARM, q_seen, P), strict=True)):
+        for r, (X, D) in enumerate(zip(Psi, ARM.mass_matrix(q_seen, P), strict=True)):
             sigma = max(np.linalg.eigvalsh(D)[0], 0.0)
             P[r] -= sigma / np.sum(X**2) * X.T @ (a_seen - q_star)[r]
-        met += np.sum(bounds.upper < P)
-        P = np.clip(P, bounds.lower, bounds.upper)
-        torques.append(u)
-        q, v = loop._advance(q, v, a, applied)
-    history = loop.history()
+        met += np.sum(bounds[1] < P)
+        P = np.clip(P, *bounds)
+        torques.append(u[0])
+        q, v = rk4(partial(PLANT, u=applied), q, v, dt[:, None])
     np.testing.assert_allclose(history.estimates, [start, P], rtol=1e-9)
     assert met > 0
     np.testing.assert_allclose(history.prx, [largest], rtol=1e-9)

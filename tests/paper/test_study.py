@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,7 +10,6 @@ import pytest
 from robotid.base.exceptions import SettingsError
 from robotid.dynamics.simulation.motions import ProgramMotion
 from robotid.paper import study
-from robotid.paper.equations import LinearPlant
 from robotid.paper.planar_2r import PAPER_PARAMETERS
 from robotid.paper.procedure import LoopSettings, run_procedure
 from robotid.paper.study import (
@@ -38,12 +38,12 @@ def test_one_shot_needs_one_run_and_disturbance_shows():
 
 
 def test_only_the_physical_arm_keeps_its_energy():
-    drift = energy_drift(duration=4.0, dt=4e-3)
-    np.testing.assert_allclose(drift.t, np.linspace(0.0, 4.0, 1001), atol=1e-12)
-    assert {len(gained) for gained in drift.gained.values()} == {1001}
-    assert np.abs(drift.gained["physical"]).max() < 1e-9  # error of the integration
-    assert np.abs(drift.gained["printed"]).max() > 0.2
-    assert np.abs(drift.gained["corrected"]).max() > 0.1  # p3 != p4
+    t, gained = energy_drift(duration=4.0, dt=4e-3)
+    np.testing.assert_allclose(t, np.linspace(0.0, 4.0, 1001), atol=1e-12)
+    assert {len(share) for share in gained.values()} == {1001}
+    assert np.abs(gained["physical"]).max() < 1e-9  # error of the integration
+    assert np.abs(gained["printed"]).max() > 0.2
+    assert np.abs(gained["corrected"]).max() > 0.1  # p3 != p4
 
 
 def test_random_runs_tell_every_failure(rng):
@@ -62,14 +62,15 @@ def test_random_runs_tell_every_failure(rng):
 def test_a_random_run_is_critically_damped_at_its_bandwidth(rng):
     dynamics, P = paper_arm("physical")
     runs = random_runs(dynamics, P, 2, 1, rng)
-    for r, w in enumerate(runs.gain):
+    drawn = runs.drawn
+    for r, w in enumerate(drawn["gain"]):
         history = run_procedure(
             dynamics,
-            LinearPlant(dynamics, P),
-            ProgramMotion(runs.amplitude[r], runs.duration[r]),
-            runs.guess[[r]],
+            partial(dynamics.acceleration, P=P),
+            ProgramMotion(drawn["amplitude"][r], drawn["duration"][r]),
+            drawn["guess"][[r]],
             settings=LoopSettings(alpha=2 * w, beta=w**2, iterations=1),
-            offset=runs.offset[r],
+            offset=drawn["offset"][r],
         )
         np.testing.assert_allclose(history.relative_error(P)[:, 0], runs.errors[:, r], rtol=1e-9)
         np.testing.assert_allclose(history.tracking[:, 0], runs.history.tracking[:, r], rtol=1e-9)

@@ -15,7 +15,7 @@ from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows, open
 from robotid.dynamics.simulation.simulator import RobotPlant
 from robotid.output.files.mjcf import write_mjcf
 from robotid.output.report.pictures import friction_chart
-from robotid.paper.equations import rk4
+from robotid.paper.procedure import rk4
 from robotid.robot.drive_term import Family, MemorylessTerm, Shape
 from robotid.robot.drives import FAMILIES, TERM_CLASSES, term_from_dict
 from robotid.robot.model import RobotModel
@@ -112,7 +112,7 @@ def test_a_new_term_is_rolled_out_with_its_sensitivity(bend):
     for u in tau[:-1]:
         state = exact[-1]
         for _ in range(2):
-            state = rk4(lambda q, v, _, u=u: plant.acceleration(q, v, u), *state, 2.5e-3)
+            state = rk4(lambda q, v, u=u: plant.acceleration(q, v, u), *state, 2.5e-3)
         exact.append(state)
     exact = np.array(exact)[:, 0]
     np.testing.assert_allclose(q, exact, atol=1e-3 * np.ptp(exact))

@@ -17,7 +17,7 @@ from robotid.diagnosis.urdf.mesh_check import audit_bodies
 from robotid.diagnosis.verdict.evidence import GOOD, error_of, is_harmless_cost
 from robotid.diagnosis.verdict.parameter_table import correlated_parameters
 from robotid.diagnosis.verdict.scale_check import friction_shares
-from robotid.estimation.estimators.consistent.body_constraints import slabs
+from robotid.estimation.estimators.consistent_fit import slabs
 from robotid.estimation.fitting.estimator_settings import BoundedSettings, ConsistentSettings
 from robotid.estimation.fitting.fitted import Fit
 from robotid.estimation.variation.variation import UnlikeRun, Variation

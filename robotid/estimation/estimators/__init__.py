@@ -1,15 +1,16 @@
 """Estimators: Problem or Factors -> Estimate. No physics engine below this folder."""
 
 from robotid.estimation.estimators.batch import OLS, TLS, WLS
-from robotid.estimation.estimators.consistent.body_constraints import Constraints
-from robotid.estimation.estimators.consistent.consistent_fit import Consistent
-from robotid.estimation.estimators.descent import PRX, DescentState, NormalisedGradient
+from robotid.estimation.estimators.consistent_fit import Consistent, Constraints
 from robotid.estimation.estimators.estimator import BatchEstimator, Estimate, Estimator
 from robotid.estimation.estimators.output_error import OutputError
 from robotid.estimation.estimators.recursive import (
+    PRX,
     RLS,
+    DescentState,
     Kalman,
     KalmanState,
+    NormalisedGradient,
     RecursiveEstimator,
     RLSState,
     fold,

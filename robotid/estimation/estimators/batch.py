@@ -9,19 +9,22 @@ import scipy.linalg
 from robotid.base.exceptions import DataError, NotConvergedError, RankDeficientError
 from robotid.base.typing import Array
 from robotid.dynamics.factors import Factors
-from robotid.estimation.estimators.estimator import BatchEstimator, Estimate, Weighing
-from robotid.estimation.estimators.segments import sandwich
+from robotid.estimation.estimators.estimator import (
+    MOST_EXPLAINED,
+    BatchEstimator,
+    Estimate,
+    Weighing,
+    sandwich,
+)
 
 _RANK = 1e-7  # relative singular value below which the rank is reduced, columns of unit norm
-_SILENT = 1e-6  # relative norm below which a column has no information
+SILENT = 1e-6  # relative norm below which a column has no information
 _OPEN = 1e-2  # share in undetermined directions above which a parameter is undetermined
 _FLOOR = 1e-9  # smallest noise level over the torque, for noise-free data
 _TOLERANCE = 1e-8  # relative change of the noise levels at which WLS has converged
 _MAX_ITERATIONS = 200
 _SETTLED = 1e-5  # relative change that is sufficient after the largest number of iterations
 _TLS_NOISE = 0.01  # [-] of the regressor's columns
-_TLS_SHARE = 0.5  # of the residual's variance, the most that noise not stated by a user explains
-_TLS_ITERATIONS = 100
 _TLS_TOLERANCE = 1e-12  # change of the torque relative to its norm
 _ALONE = 1e-6  # relative gap of the two smallest singular values below which they are equal
 
@@ -57,10 +60,8 @@ class WLS(BatchEstimator):
     """Weighted least squares: minimise sum_j |tau_j - W_j theta|^2 / sigma_j^2.
 
     The noise level sigma_j of each joint is computed from its residual and the effective degrees of
-    freedom of its rows, and is iterated to convergence, which may be slow with few rows.
-
-    References:
-        Gautier (1997), Dynamic identification of robots with power model, section II.
+    freedom of its rows, and is iterated to convergence, which may be slow with few rows. Gautier
+    (1997), Dynamic identification of robots with power model, section II.
     """
 
     prior: Array | None = None  # as in ``OLS``
@@ -102,10 +103,8 @@ class TLS(BatchEstimator):
     (W + E) theta = tau - e. The noise of a column is ``regressor_noise`` times its RMS; constant
     columns have none. It is biased if the residual is a model error, which it attributes to noise
     of the regressor. For ``regressor_noise`` towards 0 it is WLS, whose covariance it returns.
-
-    References:
-        Golub, Hoffman, Stewart (1987), A generalization of the Eckart-Young-Mirsky matrix
-        approximation theorem; Van Huffel, Vandewalle (1991), The Total Least Squares Problem, 3.6.
+    Golub, Hoffman, Stewart (1987), A generalization of the Eckart-Young-Mirsky matrix approximation
+    theorem; Van Huffel, Vandewalle (1991), The Total Least Squares Problem, 3.6.
     """
 
     #: RMS noise of the columns over their RMS [-]; None: 0.01, reduced if it exceeds half of the
@@ -138,10 +137,10 @@ class TLS(BatchEstimator):
         The residual of WLS, 1 in these units, is the sum of the torque's noise and the regressor's
         noise times theta. Share and theta depend on each other: both are iterated.
         """
-        for _ in range(_TLS_ITERATIONS):
+        for _ in range(_MAX_ITERATIONS):
             share = float(((noise * theta) ** 2).sum())
-            if self.regressor_noise is None and share > _TLS_SHARE:
-                noise, share = noise * np.sqrt(_TLS_SHARE / share), _TLS_SHARE
+            if self.regressor_noise is None and share > MOST_EXPLAINED:
+                noise, share = noise * np.sqrt(MOST_EXPLAINED / share), MOST_EXPLAINED
             elif self.regressor_noise is not None and share >= 1.0:
                 raise DataError(
                     f"regressor_noise = {self.regressor_noise:g} corresponds to "
@@ -153,7 +152,7 @@ class TLS(BatchEstimator):
             if change < _TLS_TOLERANCE:
                 return theta, share
         raise NotConvergedError(
-            f"total least squares has not converged after {_TLS_ITERATIONS} steps; reduce "
+            f"total least squares has not converged after {_MAX_ITERATIONS} steps; reduce "
             "regressor_noise",
             "max_iterations",
         )
@@ -194,7 +193,7 @@ def solve_factor(factors: Factors, sigma: Array, prior: Array | None) -> Solutio
     c = len(factors.names)
     A, d = R[:, :c], R[:, c]
     norms = np.linalg.norm(A, axis=0)
-    is_excited = norms > _SILENT * norms.max()
+    is_excited = norms > SILENT * norms.max()
     scale = np.where(is_excited, norms, 1.0)
     X = np.where(is_excited, A / scale, 0.0)
     inverse, is_singular = scipy.linalg.lapack.dtrtri(A[:c])

@@ -15,17 +15,15 @@ from robotid.base.exceptions import RankDeficientError
 from robotid.base.typing import Array
 from robotid.estimation.estimators.estimator import Estimate
 
-_PRIOR_LED = 0.9  # ratio of the spreads after and before the data above which a direction is weak
+PRIOR_LED = 0.9  # ratio of the spreads after and before the data above which a direction is weak
 _LED_IN_PART = 0.3  # share of a parameter's spread in weak directions that makes it a group member
 _COUPLED = 0.5  # ... or its coefficient relative to another member, in units of the spreads
 _JOINED = 0.05  # relative coefficient below which a term is not printed, in units of the spreads
 _TERM = 1e-3  # ... and below which it is not a term of the sum
 _TIE = 0.95  # coefficients above this share of the largest are equal to it: the first one leads
 _TERMS = 4  # largest number of printed terms of a sum
-_DIGITS = 3  # printed digits of a coefficient
-_NAMED = 5  # largest number of parameters of a group, and half as many sums, that are printed
+_NAMED = 5  # largest number of printed parameters of a group; half as many sums and groups
 _ILL_CONDITIONED = 1e3  # condition number of unit columns above which a motion is poor
-_GROUPS = 2  # largest number of groups whose sums are printed
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,7 @@ class Combination:
         text = self.names[leading]
         for i in terms[: _TERMS - 1]:
             sign = "-" if self.coefficients[i] < 0 else "+"
-            size = f"{abs(self.coefficients[i]):.{_DIGITS}g}"
+            size = f"{abs(self.coefficients[i]):.3g}"
             text += f" {sign} {self.names[i]}" if size == "1" else f" {sign} {size} {self.names[i]}"
         return text + (" + ..." if len(terms) >= _TERMS else "")
 
@@ -102,9 +100,9 @@ class Determination:
     def described(self) -> str:
         """Return a description of the groups, as "a and b are identifiable only as a + b"."""
         sums = [str(group) for group in self.merged if group.combinations]
-        texts = sums[:_GROUPS]
-        if len(sums) > _GROUPS:
-            more = len(sums) - _GROUPS
+        texts = sums[: _NAMED // 2]
+        more = len(sums) - len(texts)
+        if more:
             texts.append(f"{more} more group{'s' * (more > 1)} of this kind")
         return "; ".join(texts + [str(group) for group in self.merged if not group.combinations])
 
@@ -148,7 +146,7 @@ def determine(names: Sequence[str], rows: Array, spread: Array) -> Determination
         _, s, Vt = np.linalg.svd(rows[:, free] * spread[free])
         s = np.append(s, np.zeros(len(free) - len(s)))
         after = 1.0 / np.sqrt(1.0 + s**2)
-        open_ones = after > _PRIOR_LED
+        open_ones = after > PRIOR_LED
         weak = np.zeros((len(spread), int(open_ones.sum())))
         weak[free] = Vt[open_ones].T
         shrinkage[len(spread) - len(free) :] = after
@@ -185,8 +183,8 @@ def _groups(names: tuple[str, ...], weak: Array, spread: Array) -> tuple[Group, 
         members = np.sort(places[label == one])
         sums = [
             _combination(names, spread, [int(p), *chosen], [1.0, *-row])
-            for p, row, own in zip(others, moved, label[count:], strict=True)
-            if own == one
+            for p, row, group in zip(others, moved, label[count:], strict=True)
+            if group == one
         ]
         groups.append(Group(tuple(names[i] for i in members), tuple(sums)))
     return tuple(sorted(groups, key=lambda group: names.index(group.names[0])))

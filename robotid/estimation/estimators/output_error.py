@@ -17,17 +17,21 @@ import scipy.linalg
 from robotid.base.exceptions import DataError, NotConvergedError
 from robotid.base.typing import Array, ProgressCallback, ignore_progress
 from robotid.dynamics.factors import Factors, triangle_of
-from robotid.estimation.estimators.estimator import Estimate, Estimator
-from robotid.estimation.estimators.segments import FEWEST_SEGMENTS, at_least, sandwich, scatter
+from robotid.estimation.estimators.estimator import (
+    FEWEST_SEGMENTS,
+    ROUNDING,
+    Estimate,
+    Estimator,
+    at_least,
+    sandwich,
+    scatter,
+)
 
 _CAUTIOUS = 1e-3  # damping of a step: parameters that are not identifiable do not move
 _NEARLY_FREE = 1e-6  # damping of the last step, near the minimum
-_STEPS = 25  # largest number of damped Gauss-Newton steps in a round
-_ROUNDS = 5  # largest number of updates of whitening and noise levels ...
-_SETTLED = 2e-2  # ... until their relative change is smaller
+_SETTLED = 2e-2  # relative change of whitening and noise levels at which a fit has converged
 _ROUGH, _CLOSE = 1e-3, 1e-5  # relative decrease that ends the first round, and the others
 _TOO_STIFF = 1e10  # damping at which no step reduces the cost any more
-_MOST_RHO = 0.95  # largest correlation: beyond it, whitening removes offsets and gains
 _NO_TRACE = 1e-3  # effect of an initial state in noise levels below which it is neglected
 #: Number of segments for the scatter of scores: few enough that each is longer than the time for
 #: which an encoder stays at one step while a joint reverses.
@@ -93,20 +97,18 @@ class OutputError(Estimator[Simulator]):
     """Least squares of a simulator's whitened residuals, with priors and bounds.
 
     A damped Gauss-Newton method (Levenberg, Marquardt) in rounds. Each round computes the weights
-    from the residuals, then the parameters with these weights, until both have converged.
-
-    References:
-        Ljung (1999), System identification, 4.3 and 10.2.
+    from the residuals, then the parameters with these weights, until both have converged. Ljung
+    (1999), System identification, 4.3 and 10.2.
     """
 
     reads: ClassVar[Literal["simulator"]] = "simulator"
 
     whitens: bool = True  # whether the residual is whitened by its estimated correlation
-    #: Largest correlation of successive samples that is used, shape (n,): whitening with more than
-    #: the correlation of the loop removes the information. None: 0.95.
-    most: Array | None = None
-    steps: int = _STEPS  # largest number in a round
-    rounds: int = _ROUNDS
+    #: Largest correlation of successive samples that is used, of all joints or (n,). Whitening
+    #: with more than that of the loop removes the information, of offsets and gains first.
+    most: Array | float = 0.95
+    steps: int = 25  # largest number in a round
+    rounds: int = 5  # largest number
     #: Factor of the residuals' variance for the correlation that remains after whitening. It
     #: determines the weight relative to additional rows.
     inflation: float = 1.0
@@ -116,14 +118,10 @@ class OutputError(Estimator[Simulator]):
     progress: ProgressCallback = field(default=ignore_progress)
 
     def fit(self, data: Simulator, start: Array | None = None) -> Estimate:
-        """Estimate the parameters from initial values (c,), the prior if None.
-
-        Raises:
-            DataError: If there are fewer samples than parameters.
-            NotConvergedError: If the simulation with the initial values fails.
-        """
+        """Estimate the parameters from initial values (c,), the prior if None."""
         weights, theta, how = self._minimised(data, start)
-        return self._estimate(data, weights, theta, how)
+        residuals = data.residuals(theta, with_slopes=True, with_starts=True)
+        return self._estimate(data, weights, theta, residuals, how)
 
     def minimise(self, data: Simulator, start: Array | None = None) -> Array:
         """Return the parameters of ``fit`` alone, shape (c,), without their standard errors."""
@@ -135,13 +133,15 @@ class OutputError(Estimator[Simulator]):
         """Return the last weights, the parameters, and how they were found."""
         initial = simulator.prior if start is None else start
         theta = np.clip(np.array(initial, dtype=float), *simulator.bounds)
-        found = self._left(simulator, theta)
-        weights, rounds, count, converged = self._weigh(found), 0, 0, False
+        residuals = self._left(simulator, theta)
+        weights, rounds, count, converged = self._weigh(residuals, self.frees), 0, 0, False
         for rounds in range(1, self.rounds + 1):
             close = _ROUGH if rounds == 1 else _CLOSE
-            theta, found, steps, converged = self._descend(simulator, weights, theta, found, close)
+            theta, residuals, steps, converged = self._descend(
+                simulator, weights, theta, residuals, close
+            )
             count += steps
-            before, weights = weights, self._weigh(found)
+            before, weights = weights, self._weigh(residuals, self.frees)
             changes = weights.sigma / before.sigma - 1.0, weights.rho - before.rho
             if rounds > 1 and converged and np.abs(changes).max() < _SETTLED:
                 break
@@ -153,35 +153,35 @@ class OutputError(Estimator[Simulator]):
 
     def weights(self, simulator: Simulator, theta: Array) -> "_Weights":
         """Return correlation and noise level of the residuals at parameters (c,)."""
-        return self._weigh(self._left(simulator, theta))
+        return self._weigh(self._left(simulator, theta), self.frees)
 
     def _left(self, simulator: Simulator, theta: Array) -> Sequence[Residual]:
         """Return residuals; with derivatives by the initial states only if these are free."""
         return simulator.residuals(theta, with_slopes=False, with_starts=self.frees)
 
-    def _weigh(self, found: Sequence[Residual], *, frees: bool | None = None) -> "_Weights":
+    def _weigh(self, residuals: Sequence[Residual], frees: bool) -> "_Weights":
         """Return correlation and noise level of residuals, with fitted initial states if free."""
-        if self.frees if frees is None else frees:
-            found = [replace(r, e=_freed(r)) for r in found]
-        n = 1 + max(int(r.joints.max()) for r in found)
+        if frees:
+            residuals = [replace(r, e=_freed(r)) for r in residuals]
+        n = 1 + max(int(r.joints.max()) for r in residuals)
         rho, sigma = np.zeros(n), np.ones(n)
-        most = np.full(n, _MOST_RHO) if self.most is None else self.most
+        most = np.broadcast_to(self.most, max(n, np.size(self.most)))
         for j in range(n):
-            own = [r.e[:, k] for r in found for k in np.flatnonzero(r.joints == j)]
+            errors = [r.e[:, k] for r in residuals for k in np.flatnonzero(r.joints == j)]
             if self.whitens:
-                along = sum(float(x[1:] @ x[:-1]) for x in own)
-                rho[j] = np.clip(along / max(_squares(x[:-1] for x in own), 1e-300), 0, most[j])
-            size = sum(len(x) - 1 for x in own)
-            level = np.sqrt(_squares(x[1:] - rho[j] * x[:-1] for x in own) / max(size, 1))
-            sigma[j] = max(level, 1e-12) * np.sqrt(self.inflation)
+                along = sum(float(x[1:] @ x[:-1]) for x in errors)
+                rho[j] = np.clip(along / max(_squares(x[:-1] for x in errors), 1e-300), 0, most[j])
+            size = sum(len(x) - 1 for x in errors)
+            level = np.sqrt(_squares(x[1:] - rho[j] * x[:-1] for x in errors) / max(size, 1))
+            sigma[j] = max(level, ROUNDING) * np.sqrt(self.inflation)
         return _Weights(rho, sigma)
 
     def _cost(
-        self, simulator: Simulator, weights: _Weights, theta: Array, found: Sequence[Residual]
+        self, simulator: Simulator, weights: _Weights, theta: Array, residuals: Sequence[Residual]
     ) -> float:
-        """Return the cost of parameters with the residuals ``found``."""
+        """Return the cost of parameters with these residuals."""
         cost = 0.0
-        for r in found:
+        for r in residuals:
             b = weights.whiten(r.e, r.joints).reshape(-1)
             U = _by_start(r, weights) if self.frees else np.zeros((len(b), 0))
             cost += float(b @ b) - float(np.sum((U.T @ b) ** 2))
@@ -207,15 +207,12 @@ class OutputError(Estimator[Simulator]):
 
         With fixed initial states the fit is biased, because these were fitted with earlier
         parameters. The standard errors of an estimate assume free initial states.
-
-        Raises:
-            NotConvergedError: If the simulation after the step fails.
         """
-        found = simulator.residuals(estimate.theta, with_slopes=True, with_starts=True)
-        weights = self._weigh(found, frees=True)
+        residuals = simulator.residuals(estimate.theta, with_slopes=True, with_starts=True)
+        weights, theta = self._weigh(residuals, frees=True), estimate.theta
         how = {key: getattr(estimate, key) for key in ("converged", "n_iter", "message")}
-        settled = self._estimate(simulator, weights, estimate.theta, how, found=found)
-        self._left(simulator, settled.theta)
+        settled = self._estimate(simulator, weights, theta, residuals, how, moves=True)
+        self._left(simulator, settled.theta)  # raises NotConvergedError if it fails
         return settled
 
     def moved(self, simulator: Simulator, other: Simulator, theta: Array) -> tuple[Array, Array]:
@@ -250,14 +247,14 @@ class OutputError(Estimator[Simulator]):
         simulator: Simulator,
         weights: _Weights,
         theta: Array,
-        found: Sequence[Residual],
+        residuals: Sequence[Residual],
         close: float,
     ) -> tuple[Array, Sequence[Residual], int, bool]:
-        """Minimise with fixed weights from parameters with the residuals ``found``.
+        """Minimise with fixed weights from parameters with these residuals.
 
         Return the parameters, their residuals, the number of steps, and whether it converged.
         """
-        damping, cost = _CAUTIOUS, self._cost(simulator, weights, theta, found)
+        damping, cost = _CAUTIOUS, self._cost(simulator, weights, theta, residuals)
         if not np.isfinite(cost):
             raise NotConvergedError(
                 "the simulation of the closed loop with the initial values diverges; state gains "
@@ -269,7 +266,7 @@ class OutputError(Estimator[Simulator]):
             H, g = self.normal(simulator, weights, theta, frees=self.frees)
             while True:
                 trial = _bounded_step(H, g, theta, simulator.bounds, damping)
-                left, new = found, np.inf
+                left, new = residuals, np.inf
                 try:
                     left = self._left(simulator, trial)
                     new = self._cost(simulator, weights, trial, left)
@@ -281,31 +278,29 @@ class OutputError(Estimator[Simulator]):
                     break  # the predicted decrease is negligible
                 damping *= 6.0
             if not new < cost:
-                return theta, found, step, True  # no step reduces the cost noticeably
-            decrease, theta, found, cost = (cost - new) / cost, trial, left, new
+                return theta, residuals, step, True  # no step reduces the cost noticeably
+            decrease, theta, residuals, cost = (cost - new) / cost, trial, left, new
             damping = max(damping / 6.0, 1e-9)
             if decrease < close:
-                return theta, found, step, True
-        return theta, found, self.steps, False
+                return theta, residuals, step, True
+        return theta, residuals, self.steps, False
 
     def _estimate(
         self,
         simulator: Simulator,
         weights: _Weights,
         theta: Array,
+        residuals: Sequence[Residual],
         how: Mapping[str, Any],
         *,
-        found: Sequence[Residual] | None = None,
+        moves: bool = False,
     ) -> Estimate:
         """Return the estimate with standard errors from the scatter of the scores of segments.
 
-        With residuals ``found``, it is the estimate after a step with free initial states.
+        If it ``moves``, it is the estimate after a step with free initial states.
         """
-        moves = found is not None
-        if found is None:
-            found = simulator.residuals(theta, with_slopes=True, with_starts=True)
-        parts = list(_whitened(found, weights, frees=True))
-        rows = sum(r.e.size for r in found)
+        parts = list(_whitened(residuals, weights, frees=True))
+        rows = sum(r.e.size for r in residuals)
         if rows < len(theta):
             raise DataError(
                 f"{rows} samples of position for {len(theta)} parameters, wanted at least as many "
@@ -322,10 +317,10 @@ class OutputError(Estimator[Simulator]):
         segments = _segments(parts, len(theta), are_windows=self.frees)
         meat, inflation, freedom = H - np.diag(known), 1.0, np.full(len(theta), np.inf)
         if len(segments) >= FEWEST_SEGMENTS:
-            seen = scatter(segments, change, np.ones(1), bread)
-            meat, inflation, freedom = seen.meat, seen.inflation, seen.freedom()
+            scores = scatter(segments, change, np.ones(1), bread)
+            inflation, freedom = scores.inflation, scores.freedom()
             further = simulator.rows(theta)[0]
-            meat = meat + further.T @ further
+            meat = scores.meat + further.T @ further
         # standard errors are at least those for independent rows
         independent = np.diag(bread @ H @ bread.T)
         gained = 1.0 - independent * known  # relative reduction of each prior variance
@@ -374,8 +369,8 @@ def linearised(
     simulator: Simulator, weights: _Weights, theta: Array, *, frees: bool = False
 ) -> Iterable[tuple[Array, Array, Array]]:
     """Yield whitened rows A, b and the indices of their columns, window by window: theta (c,)."""
-    found = simulator.residuals(theta, with_slopes=True, with_starts=frees)
-    yield from _whitened(found, weights, frees=frees)
+    residuals = simulator.residuals(theta, with_slopes=True, with_starts=frees)
+    yield from _whitened(residuals, weights, frees=frees)
 
 
 def segment_scores(simulator: Simulator, estimate: Estimate) -> tuple[Array, Array]:
@@ -394,10 +389,10 @@ def segment_scores(simulator: Simulator, estimate: Estimate) -> tuple[Array, Arr
 
 
 def _whitened(
-    found: Iterable[Residual], weights: _Weights, *, frees: bool
+    residuals: Iterable[Residual], weights: _Weights, *, frees: bool
 ) -> Iterable[tuple[Array, Array, Array]]:
     """Yield the whitened rows of residuals; see ``linearised``."""
-    for r in found:
+    for r in residuals:
         b = weights.whiten(r.e, r.joints)
         if r.slopes is None:
             raise DataError("the simulator returned no derivatives, wanted with_slopes=True")
@@ -454,19 +449,19 @@ def _bounded_step(H: Array, g: Array, theta: Array, bounds: Array, damping: floa
 
 
 def _segments(
-    found: Sequence[tuple[Array, Array, Array]], c: int, *, are_windows: bool
+    parts: Sequence[tuple[Array, Array, Array]], c: int, *, are_windows: bool
 ) -> list[Factors]:
     """Return the factors of the whitened rows of c parameters, segment by segment.
 
     With ``are_windows`` each window is about one segment: without feedback an early error persists
     until the end of the window.
     """
-    total, names = sum(len(b) for _, b, _ in found), tuple(map(str, range(c)))
+    total, names = sum(len(b) for _, b, _ in parts), tuple(map(str, range(c)))
     segments: list[Factors] = []
-    for A, b, columns in found:
+    for A, b, columns in parts:
         cuts = max(1, round(_SEGMENTS * len(b) / total))
         if are_windows:
-            cuts = math.ceil(FEWEST_SEGMENTS / len(found))
+            cuts = math.ceil(FEWEST_SEGMENTS / len(parts))
         for rows in np.array_split(np.arange(len(b)), cuts):
             triangle = triangle_of(np.column_stack([A[rows], b[rows]]))
             segments.append(Factors((triangle,), (columns,), np.array([len(rows)]), names))

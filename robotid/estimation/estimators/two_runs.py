@@ -20,13 +20,18 @@ import scipy.linalg
 from robotid.base.exceptions import DataError, NotConvergedError
 from robotid.base.typing import Array
 from robotid.dynamics.factors import Factors, Reduction, merge, triangle_of
-from robotid.estimation.estimators.segments import FEWEST_SEGMENTS, at_least, sandwich, scatter
+from robotid.estimation.estimators.estimator import (
+    FEWEST_SEGMENTS,
+    LEAST_FREEDOM,
+    ROUNDING,
+    at_least,
+    sandwich,
+    scatter,
+)
 from robotid.robot.parameters import ParameterLayout
 
 _WIDE = 10.0  # factor of the prior standard deviations about the URDF's values
 _FLOOR = 1e-7  # smallest noise level over the torque, for noise-free data
-_LEAST_FREEDOM = 0.1  # smallest degrees of freedom of a noise level, as a share of the rows
-_SINGULAR = 1e-12  # pivot below which a column of unit norm is singular
 _STEPS = 50
 _SETTLED = 1e-9  # relative change of the gains at convergence
 _LONGEST = 1.0  # largest step of the logarithm of a gain
@@ -97,7 +102,7 @@ class TwoRuns:
         without, loaded = self._whole
         other = theta[:b] + self.known + self.D @ theta[b:]
         together = without.residual_squares(theta[:b]) + loaded.residual_squares(other)
-        return np.asarray(together / np.maximum(self._own_squares, 1e-300))
+        return np.asarray(together / np.maximum(self._separate_squares, 1e-300))
 
     def residual_ratios_by_scales(self, free: int) -> Array:
         """Return these ratios if the runs differ by the scale of torques instead of x."""
@@ -110,11 +115,11 @@ class TwoRuns:
         mean = np.append(self.mean[:end], 0.0)
         scaled = replace(self, D=explained, mean=mean, precision=precision)
         left = without.residual_squares(beta)
-        for j, (R, own) in enumerate(zip(loaded.triangles, loaded.columns, strict=True)):
-            A = R[:, :-1] @ explained[own]
+        for j, (R, columns) in enumerate(zip(loaded.triangles, loaded.columns, strict=True)):
+            A = R[:, :-1] @ explained[columns]
             left[j] += np.sum((R[:, -1] - A @ np.linalg.lstsq(A, R[:, -1], rcond=None)[0]) ** 2)
-        of_each: Array = left / np.maximum(self._own_squares, 1e-300)
-        return min(scaled.residual_ratios(scaled.compare().theta), of_each, key=np.mean)
+        by_joint: Array = left / np.maximum(self._separate_squares, 1e-300)
+        return min(scaled.residual_ratios(scaled.compare().theta), by_joint, key=np.mean)
 
     def _level(self, gain: Array) -> Array:
         """Return noise levels for rows treated as independent, shape (n,) [N m or N]."""
@@ -131,7 +136,7 @@ class TwoRuns:
         return merge(self._whole)
 
     @cached_property
-    def _own_squares(self) -> Array:
+    def _separate_squares(self) -> Array:
         """Residual sums of squares of separate fits for each joint and run, shape (n,)."""
         squares = [[R[-1, -1] ** 2 for R in run.triangles] for run in self._whole]
         return np.asarray(np.sum(squares, axis=0))
@@ -143,7 +148,7 @@ class TwoRuns:
         If a joint moves in a few rows only, its residual is 0 whatever its noise; its RMS signal is
         used then. Rows that are projected together have one noise level.
         """
-        rows, squares = np.maximum(self._logged.rows, 1), self._own_squares
+        rows, squares = np.maximum(self._logged.rows, 1), self._separate_squares
         used = np.array([len(columns) for columns in self._logged.columns])
         torque = self._logged.torque_squares()
         if self._logged.is_projected:
@@ -152,7 +157,7 @@ class TwoRuns:
             rows, used = max(self._logged.rows.sum(), 1) * one, len(self.known) * one
             torque = torque.sum() * one
         used = len(self._whole) * used
-        freedom = np.maximum(rows - used / self.share, _LEAST_FREEDOM * rows)
+        freedom = np.maximum(rows - used / self.share, LEAST_FREEDOM * rows)
         signal = np.sqrt(torque / rows)
         is_seen = self._logged.is_projected | (self.share * rows > used)
         noise = np.where(is_seen, np.sqrt(squares / freedom), signal)
@@ -183,9 +188,9 @@ class TwoRuns:
         unknown = self.unknown.tolist() if at is not None or is_start else []
         added = range(S.shape[1] - len(S) + len(unknown))
         triangles, columns = [], []
-        for j, (R, own) in enumerate(zip(run.triangles, run.columns, strict=True)):
-            used = np.flatnonzero(S[own].any(axis=0))
-            W, known, torque = R[:, :-1] @ S[own], R[:, :-1] @ c[own], gain[j] * R[:, -1]
+        for j, (R, base) in enumerate(zip(run.triangles, run.columns, strict=True)):
+            used = np.flatnonzero(S[base].any(axis=0))
+            W, known, torque = R[:, :-1] @ S[base], R[:, :-1] @ c[base], gain[j] * R[:, -1]
             rows = W[:, used]
             if j in unknown:
                 used = np.append(used, S.shape[1] + unknown.index(j))
@@ -199,9 +204,9 @@ class TwoRuns:
             tuple(triangles), tuple(columns), run.rows, names, is_projected=run.is_projected
         )
 
-    def _minimum(self, whole: Factors, sigma: Array) -> tuple[Array, Array]:
+    def _minimum(self, factors: Factors, sigma: Array) -> tuple[Array, Array]:
         """Return the minimum of rows and prior, and the inverse information."""
-        rows, size = whole.weighted(sigma), len(self.mean)
+        rows, size = factors.weighted(sigma), len(self.mean)
         root = np.zeros((size, rows.shape[1]))
         root[:, :size] = scipy.linalg.cholesky(self.precision)
         root[:, -1] = root[:, :size] @ self.mean
@@ -209,7 +214,7 @@ class TwoRuns:
         scale = np.linalg.norm(stacked[:, :-1], axis=0)
         scale[scale == 0] = 1.0
         R = triangle_of(np.column_stack([stacked[:, :-1] / scale, stacked[:, -1]]))
-        if len(self.unknown) and np.abs(np.diag(R)[:-1]).min() < _SINGULAR:
+        if len(self.unknown) and np.abs(np.diag(R)[:-1]).min() < ROUNDING:
             raise DataError(
                 "an unknown gain is not identifiable: the current of a joint is 0 or constant, or "
                 "it is not coupled to a joint of known gain or to the known mass; state the gain "
@@ -232,8 +237,8 @@ class TwoRuns:
         runs = list(enumerate((self.reference, self.loaded)))
         segments = [self._extended(f, loaded, gain, at) for loaded, run in runs for f in run]
         covariance, freedom = self._scattered(segments, gain, solution, bread)
-        whole = [self._extended(run, loaded, gain, at) for loaded, run in enumerate(self._whole)]
-        joints = [_of_joint(run, j) for run in whole for j in range(len(gain))]
+        both = [self._extended(run, loaded, gain, at) for loaded, run in enumerate(self._whole)]
+        joints = [_of_joint(run, j) for run in both for j in range(len(gain))]
         is_alone = not self._logged.is_projected  # else the rows of joints are mixed
         if by_joint and is_alone and len(joints) >= FEWEST_SEGMENTS:
             other, few = self._scattered(joints, gain, solution, bread)
@@ -245,11 +250,10 @@ class TwoRuns:
         self, parts: Sequence[Factors], gain: Array, solution: Array, bread: Array
     ) -> tuple[Array, Array]:
         """Return covariance and degrees of freedom from the scores of parts of the rows."""
-        own, size = self.share * bread, len(self.mean)
-        found = scatter(parts, solution, np.abs(gain) * self._noise, own)
-        meat = self.share**2 * found.meat
+        scores = scatter(parts, solution, np.abs(gain) * self._noise, self.share * bread)
+        meat, size = self.share**2 * scores.meat, len(self.mean)
         meat[:size, :size] += self.precision
-        return sandwich(bread, meat), found.freedom()
+        return sandwich(bread, meat), scores.freedom()
 
 
 def _of_joint(factors: Factors, joint: int) -> Factors:
@@ -274,8 +278,8 @@ def payload_runs(
     """Return the comparison of a run without and a run with payloads.
 
     The robot's inertias are the same in both runs. Friction and offsets of the drives differ,
-    because they change with load and temperature. K (b, p), urdf (p,), spread (p,); payloads are
-    columns (b, c), known values (c,), NaN for unknown ones, and their spread (c,).
+    because they change with load and temperature. Payloads are columns (b, c), known values (c,),
+    NaN for unknown ones, and their spread (c,).
     """
     columns, known, size = payloads
     changing = [not term.is_inertia for _, term in layout.drive_parameters]

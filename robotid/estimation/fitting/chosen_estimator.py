@@ -24,7 +24,7 @@ from robotid.estimation.estimators import (
     NormalisedGradient,
     RecursiveEstimator,
 )
-from robotid.estimation.estimators.prior_weight import (
+from robotid.estimation.estimators.consistent_fit import (
     AS_GOOD,
     Segments,
     choose_weight,

@@ -19,7 +19,7 @@ from robotid.data.signals import turns_note
 from robotid.dynamics.factors import Factors, merge
 from robotid.dynamics.prediction import predict
 from robotid.estimation.fitting.survey import PieceTask, SurveyedLog
-from robotid.estimation.workers.plan import WorkPlan
+from robotid.estimation.work_plan import WorkPlan
 from robotid.robot.model import RobotModel
 
 _SHOWN = 10_000  # samples at the start, in the middle and at the end that are stored for plots

@@ -14,7 +14,7 @@ from robotid.dynamics.problem import Block, Problem, concatenate
 from robotid.dynamics.rows import keep_inertial_rows
 from robotid.dynamics.used_rows import base_problem, independent_share
 from robotid.estimation.fitting.survey import ReducedPiece, SurveyedLog
-from robotid.estimation.workers.plan import WorkPlan
+from robotid.estimation.work_plan import WorkPlan
 from robotid.robot.model import RobotModel
 
 _SEGMENTS = 48  # of all logs in memory: enough to estimate the scatter of their scores

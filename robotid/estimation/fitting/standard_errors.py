@@ -19,7 +19,7 @@ from robotid.dynamics.factors import Factors
 from robotid.dynamics.torque import trajectory_regressor
 from robotid.estimation.estimators import Consistent, Estimate
 from robotid.estimation.estimators.batch import solve_factor
-from robotid.estimation.estimators.segments import FEWEST_SEGMENTS, quantile, scatter
+from robotid.estimation.estimators.estimator import FEWEST_SEGMENTS, quantile, scatter
 from robotid.robot.model import RobotModel
 
 _DRAWS = 64  # fits to resampled data and prior, for standard errors with active bounds

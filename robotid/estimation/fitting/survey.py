@@ -42,7 +42,7 @@ from robotid.dynamics.factors import Reduction
 from robotid.dynamics.prediction import is_loaded, remember
 from robotid.dynamics.rows import COMPILED, choose_engine
 from robotid.dynamics.used_rows import base_problem, prefers_measured, row_mask, static_rows
-from robotid.estimation.workers.plan import Workload
+from robotid.estimation.work_plan import Workload
 from robotid.robot.model import RobotModel
 
 #: Default number of rows of a piece.

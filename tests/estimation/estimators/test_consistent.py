@@ -10,14 +10,14 @@ from helpers.synthetic import truth
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.dynamics.factors import Factors, compress, triangle_of
-from robotid.estimation.estimators import PRX, WLS, Consistent
-from robotid.estimation.estimators.consistent.body_constraints import (
+from robotid.estimation.estimators import WLS, Consistent
+from robotid.estimation.estimators.consistent_fit import (
     Constraints,
     Subspace,
     slabs,
 )
-from robotid.estimation.estimators.consistent.interior_point import Entropic
 from robotid.estimation.estimators.estimator import Estimate
+from robotid.estimation.estimators.interior_point import Entropic
 from robotid.estimation.fitting.chosen_estimator import make_constraints
 from robotid.estimation.fitting.estimator_settings import ConstraintSettings
 from robotid.robot.geometry import body_boxes
@@ -84,26 +84,6 @@ def test_it_is_the_divergence_of_two_gaussians(prior, std):
     assert penalty.value(pi) == np.inf
 
 
-def moved(pi, H):
-    """Return inertial parameters of two bodies in another frame and scale of length."""
-    bodies = [inertial_from_pseudo_inertia(H @ J @ H.T) for J in pseudo_inertia(pi[:20])]
-    return np.concatenate([*bodies, pi[20:]])
-
-
-def test_it_depends_on_neither_frame_nor_units(prior, std, rng):
-    H = np.eye(4)
-    H[:3, :3] = np.linalg.qr(rng.standard_normal((3, 3)))[0]
-    H[:3, 3] = [0.3, -0.2, 0.5]
-    pi = prior.copy()
-    pi[[0, 4, 12]] += 0.05 * std[[0, 4, 12]]
-    here = penalty_of(prior, std).value(pi)
-    assert penalty_of(moved(prior, H), std).value(moved(pi, H)) == pytest.approx(here, rel=1e-9)
-    # the same robot in millimetres and grams
-    units = np.array([1e3, *[1e6] * 3, *[1e9] * 6])
-    scale = np.concatenate([units, units, [1.0, 1.0]])
-    assert penalty_of(prior * scale, std * scale).value(pi * scale) == pytest.approx(here, rel=1e-8)
-
-
 def test_a_prior_without_mass_is_widened_to_a_hundredth_of_its_size(prior, std):
     pi = prior.copy()
     pi[:10] = 0.0
@@ -111,16 +91,6 @@ def test_a_prior_without_mass_is_widened_to_a_hundredth_of_its_size(prior, std):
     assert 0.0 < penalty.centre[0] <= 0.011 * std[0]
     np.testing.assert_allclose(penalty.centre[10:], pi[10:], rtol=1e-13)
     assert np.isfinite(penalty.hessian(penalty.centre)).all()
-
-
-def test_the_known_part_of_a_body_is_no_part_of_the_distance(prior, std):
-    held = np.zeros(20)
-    held[:10] = 0.5 * prior[:10]
-    pi = prior.copy()
-    pi[0] *= 1.05
-    free, with_held = (penalty_of(prior, std, h) for h in (None, held))
-    # the rest is half as large, so that the same change is twice as much of it
-    assert with_held.value(pi) > 3 * free.value(pi)
 
 
 def test_a_subspace_holds_what_the_equalities_say(rng):
@@ -151,18 +121,6 @@ def masses(estimate):
 def centre(estimate, body):
     values = estimate.theta[10 * body : 10 * body + 4]
     return values[1:] / values[0]
-
-
-def test_bounds_of_mass_are_kept_and_reached(case):
-    fit, factors = case
-    free = masses(fit.fit(factors))
-    low, high = 1.2 * free[2], 0.7 * free[3]
-    mass = {"forearm_link": (low, np.inf), "wrist_1_link": (0.0, high)}
-    estimate = constrained(fit, mass=mass).fit(factors)
-    assert masses(estimate)[2] == pytest.approx(low, rel=1e-6)
-    assert masses(estimate)[3] == pytest.approx(high, rel=1e-6)
-    assert {"mass forearm_link", "mass wrist_1_link"} <= set(estimate.details["active"])
-    assert "mass" in estimate.details["constraints"]
 
 
 def test_a_known_total_mass_is_met_exactly(case):
@@ -341,33 +299,10 @@ def test_consistent_fit_is_physical_where_least_squares_is_not(ur5, rng):
     assert (estimate.theta[ur5.layout.is_nonnegative()] >= 0).all()
 
 
-def test_the_held_share_of_a_body_is_respected(ur5, rng):
-    case = Case(ur5, rng, NOISE)
-    held = np.zeros(60)
-    # the last link is known to carry a 5 kg part, more than it has: the rest must stay possible
-    held[50:] = [5.0, 0, 0, 0, 0.05, 0, 0.05, 0, 0, 0.05]
-    estimate = consistent(case, held=held).fit(case.problem)
-    rest = pseudo_inertia(estimate.theta[:60] - held)
-    assert np.linalg.eigvalsh(rest).min() > 0
-    assert estimate.theta[50] > 5.0
-
-
 def test_a_prior_that_is_not_finite_is_refused(ur5, rng):
     case = Case(ur5, rng, NOISE)
     with pytest.raises(DataError, match="prior and held must be finite"):
         consistent(case, held=np.full(60, np.nan))
-
-
-def test_projection_is_the_consistent_fit_of_the_same_data(ur5, rng):
-    case = Case(ur5, rng, 4 * NOISE)
-    wls = WLS().fit(case.problem)
-    fit = consistent(case).fit(case.problem)
-    projected = consistent(case).project(wls)
-    distance = np.abs(case.base(projected) - case.base(fit)) / wls.std_error
-    assert distance.max() < 1e-3
-    nothing = PRX(np.ones(6)).estimate(PRX(np.ones(6)).init(58), case.problem.names)
-    with pytest.raises(DataError, match="the estimate has no covariance"):
-        consistent(case).project(nothing)
 
 
 class Small:
@@ -444,3 +379,5 @@ def test_a_projection_is_of_the_parameters_with_a_variance_and_the_prior(rng):
         "rls; projected onto physically consistent parameters, interior"
     )
     assert "c" in found.undetermined
+    with pytest.raises(DataError, match="the estimate has no covariance"):
+        case.fit.project(replace(running, covariance=np.full((7, 7), np.inf)))

@@ -10,7 +10,7 @@ from scipy import sparse
 from robotid.base.exceptions import NotConvergedError
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.estimators import Consistent
-from robotid.estimation.estimators.consistent.body_constraints import Constraints
+from robotid.estimation.estimators.consistent_fit import Constraints
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import (

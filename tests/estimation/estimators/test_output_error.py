@@ -72,16 +72,6 @@ def test_parameters_are_recovered_without_noise(rng):
     assert found.names == ("gain", "time", "offset")
 
 
-def test_standard_errors_are_the_scatter_of_many_noises():
-    rng = np.random.default_rng(5)
-    draws = [OutputError().fit(lagging(rng, windows=12), TRUTH) for _ in range(60)]
-    theta = np.array([d.theta for d in draws])
-    ratio = np.mean([d.std_error for d in draws], axis=0) / theta.std(axis=0)
-    assert ((ratio > 0.8) & (ratio < 1.25)).all(), ratio
-    bias = (theta.mean(axis=0) - TRUTH) / (theta.std(axis=0) / np.sqrt(60))
-    assert np.abs(bias).max() < 4
-
-
 @pytest.mark.parametrize("bounds", [(2.0, np.inf), (-np.inf, 1.2)])
 def test_a_bound_holds_and_is_named(rng, bounds):
     lag = lagging(rng, bounds=np.array([bounds, (0.0, np.inf), (-np.inf, np.inf)]).T)

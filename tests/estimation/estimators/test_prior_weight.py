@@ -14,8 +14,8 @@ from helpers.synthetic import exact_log, truth
 from robotid.base.exceptions import DataError
 from robotid.dynamics.factors import compress, compress_segments, merge
 from robotid.estimation.estimators import Constraints
-from robotid.estimation.estimators import prior_weight as weighting
-from robotid.estimation.estimators.prior_weight import (
+from robotid.estimation.estimators import consistent_fit as weighting
+from robotid.estimation.estimators.consistent_fit import (
     Segments,
     choose_weight,
     contradicted_extents,
@@ -75,7 +75,7 @@ def test_the_held_out_errors_are_those_of_a_loop_by_hand(case):
         part = slice(200 * 6 * k, 200 * 6 * (k + 1))
         residual = (tau - W @ (fit.K @ pi))[part].reshape(-1, 6) / NOISE
         total, count = total + (residual**2).sum(axis=0), count + len(residual)
-    squares, _ = held_out_errors(fit, Segments.of(fit, segments, NOISE), 2.0)
+    squares, _ = held_out_errors(fit, replace(Segments.of(fit, segments), sigma=NOISE), 2.0)
     error = np.sqrt(squares.sum(axis=0))
     # it is computed to the solver's tolerance only
     np.testing.assert_allclose(error, np.sqrt(total / count), rtol=2e-4)
@@ -106,7 +106,7 @@ def chosen(case, monkeypatch, excess, repeated=0.0):
     def errors(fit, segments, w, starts):
         return (1.0 + abs(np.log10(w)) * np.asarray(excess)) / 6.0, []
 
-    monkeypatch.setattr("robotid.estimation.estimators.prior_weight.held_out_errors", errors)
+    monkeypatch.setattr("robotid.estimation.estimators.consistent_fit.held_out_errors", errors)
     return choose_weight(fit, Segments.of(fit, cut(problem, 6)), "cv", repeated)
 
 
@@ -181,7 +181,7 @@ def test_an_extent_is_contradicted_beyond_the_scatter_of_segments(ur5, monkeypat
     def errors(one, segments, weight, starts=None):
         return np.ones((4, 1)) + (one is fit) * scatter[:, None], []
 
-    monkeypatch.setattr("robotid.estimation.estimators.prior_weight.held_out_errors", errors)
+    monkeypatch.setattr("robotid.estimation.estimators.consistent_fit.held_out_errors", errors)
     assert contradicted_extents(fit, Segments.of(fit, cut(case.problem, 4))) == named
 
 

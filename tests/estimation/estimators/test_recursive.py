@@ -7,7 +7,6 @@ from helpers.estimation import NOISE, Case
 
 from robotid.base.exceptions import DataError, RankDeficientError
 from robotid.dynamics.problem import Problem, Sample
-from robotid.dynamics.torque import build_problem, joint_torque_regressor
 from robotid.estimation.estimators import RLS, WLS, Kalman, fold
 
 NAMES = ("a", "b", "c")
@@ -122,26 +121,6 @@ def test_few_samples_are_refused_with_forgetting_too(rng):
     problem = replace(problem, stream=lambda: iter([(Y[0], tau[0], one)] * 2))
     with pytest.raises(DataError, match="2 torque rows for 3 parameters"):
         RLS(np.ones(2), 1.0, np.zeros(3), np.ones(3)).fit(problem)
-
-
-def test_a_walking_filter_follows_a_change_and_a_still_one_does_not(ur5, rng):
-    case = Case(ur5, rng, 0.1 * NOISE, samples=2000)
-    other = 1.2 * case.pi
-    tau = np.array(case.trajectory.tau)
-    t = case.trajectory
-    tau[1000:] += (joint_torque_regressor(ur5, t.q, t.v, t.a) @ (other - case.pi)).reshape(-1, 6)[
-        1000:
-    ]
-    problem = case.mapping.reduce(build_problem(ur5, replace(t, tau=tau)))
-    target = case.mapping.to_base(other)
-
-    def miss(estimator):
-        return np.linalg.norm(estimator.fit(problem).theta - target) / np.linalg.norm(target)
-
-    prior, std = case.beta, np.full(len(case.beta), 5.0)
-    still = miss(Kalman(0.1 * NOISE, prior, std, gate=None))
-    assert miss(Kalman(0.1 * NOISE, prior, std, walk=1e-3, gate=None)) < 0.2 * still
-    assert miss(RLS(NOISE, 0.99, prior, std)) < 0.05 * still
 
 
 @pytest.mark.parametrize("share", [1.0, 0.25])

@@ -12,7 +12,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.data.signals import process
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.estimators import Consistent
-from robotid.estimation.estimators.consistent.interior_point import nearest
+from robotid.estimation.estimators.interior_point import nearest
 from robotid.robot.prior import prior_spread
 
 

@@ -13,7 +13,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors, merge
 from robotid.estimation.estimators import OLS, WLS
-from robotid.estimation.estimators.segments import scatter
+from robotid.estimation.estimators.estimator import scatter
 from robotid.estimation.fitting.standard_errors import (
     measured_errors,
     standard_of,

@@ -10,7 +10,6 @@ import signal
 import socket
 import threading
 import time
-from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -43,20 +42,17 @@ _ATTEMPTS = (3, 2)
 # The pool's feeder thread may be the last owner of a semaphore. If the process ends between the
 # calls that remove and unregister it, the resource tracker warns of a leak.
 _FEEDER = "QueueFeederThread"
-_PATIENCE = 5.0  # largest time to wait for this thread [s]
-_ANSWER = 30.0  # ... for a worker of a cluster [s]
+_ANSWER = 30.0  # largest time to wait for this thread, or for a worker of a cluster [s]
 
 
 class Workload(Protocol):
     """A unit of work, such as a piece of a log; can be pickled."""
 
     @property
-    @abstractmethod
     def name(self) -> str:
         """Name in messages, such as ``run3.parquet rows 0-16384``."""
 
     @property
-    @abstractmethod
     def samples(self) -> int:
         """Approximate number of samples, for the progress."""
 
@@ -130,7 +126,10 @@ class WorkPlan:
         if self._executor is None:
             self._size = choose_workers(pieces, self.workers)
         is_here = self.scheduler is None and self._size == 1
-        how = "this process" if is_here else self.description
+        how = f"{self._size} worker processes, one BLAS thread each"
+        if self.scheduler is not None:
+            how = f"the Dask cluster {self.scheduler}, one BLAS thread per piece"
+        how = "this process" if is_here else how
         _log.info("%s %d pieces, %d %s in total: %s", what, len(pieces), total, counted, how)
         report(what, done, total, counted)
         every = enumerate(pieces)
@@ -148,13 +147,6 @@ class WorkPlan:
             if not self._reuses:
                 self.close()
 
-    @property
-    def description(self) -> str:
-        """Name of the workers in messages, such as ``2 worker processes``."""
-        if self.scheduler is None:
-            return f"{self._size} worker processes, one BLAS thread each"
-        return f"the Dask cluster {self.scheduler}, one BLAS thread per piece"
-
     def close(self, *, is_urgent: bool = False) -> None:
         """Stop the workers, without waiting if it is urgent; the next work starts new ones."""
         executor, client = self._executor, self._client
@@ -165,7 +157,7 @@ class WorkPlan:
             executor.shutdown(wait=True, kill_workers=is_urgent)  # type: ignore[call-arg]
             for thread in threading.enumerate():
                 if thread.name == _FEEDER:
-                    thread.join(_PATIENCE)
+                    thread.join(_ANSWER)
 
     def run(
         self, work: Work, pieces: Iterable[tuple[int, Workload]], lost: Lost | None = None

@@ -20,7 +20,7 @@ from robotid.base.exceptions import (
     WorkerError,
 )
 from robotid.dynamics.factors import available_cores
-from robotid.estimation.workers.plan import WorkPlan, choose_workers
+from robotid.estimation.work_plan import WorkPlan, choose_workers
 
 # a busy disk is no error of a cluster
 pytestmark = pytest.mark.filterwarnings("ignore:Creating scratch directories:UserWarning")
@@ -172,7 +172,7 @@ def test_a_script_needs_no_guard_and_its_workers_end_with_it(tmp_path):
     script.write_text(
         f"import os, sys\nsys.path.insert(0, {str(ROOT / 'tests')!r})\n"
         "from helpers.piecework import pieces_in, reduce_piece\n"
-        "from robotid.estimation.workers.plan import WorkPlan\n"
+        "from robotid.estimation.work_plan import WorkPlan\n"
         "with WorkPlan(2) as plan:\n"
         "    print(len(list(plan.map(reduce_piece, pieces_in('marks'), 'reducing'))), flush=True)\n"
         "    os.kill(os.getpid(), int(sys.argv[1]))\n"

@@ -19,7 +19,7 @@ References:
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -27,7 +27,7 @@ import scipy.linalg
 
 from robotid.base.exceptions import NotConvergedError
 from robotid.base.typing import Array
-from robotid.estimation.estimators.consistent.body_constraints import Bounds, Subspace
+from robotid.estimation.estimators.estimator import ROUNDING
 from robotid.robot.parameters import (
     ParameterLayout,
     inertial_from_pseudo_inertia,
@@ -39,15 +39,13 @@ _EXACT = 1e-12  # relative decrease of the objective per step at which a fit is 
 _ROUGH = 1e-6  # ... and at which it is sufficient for a prediction
 _TOGETHER = 2**17  # entries of the data sets that are fitted in one pass: they fit into a cache
 _CONTRADICTED = 1e-7  # distance of the NNLS problem below which the inequalities contradict
-_SINGULAR = 1e-12  # ratio of the axes of a body, squared, below which it is singular
 _THINNEST = 0.01  # smallest relative thickness of a prior's pseudo-inertia
 _SIZE, _ENTRIES = 4, 10  # of a pseudo-inertia, and of its upper triangle
 _MOST = 100  # steps; 8 to 20 are typical
 _BACK = 0.995  # largest step as a share of the step length to the boundary
 _FIRST = 1e-2  # initial t over the squared torque error of the prior, per eigenvalue
 _WARM = 0.1  # initial mu near the minimum, over the weight
-_SHORT = 0.3  # step length below which the correction is omitted, and mu is reduced to ...
-_CENTRED = 0.3
+_SHORT = 0.3  # step length below which the correction is omitted, and share of mu that then stays
 _LEAST = 1e-10  # smallest slack of an active inequality, in prior standard deviations
 _EYE = np.arange(_SIZE)
 _COLUMNS, _ROWS = np.tril_indices(_SIZE)  # of an upper triangle by columns
@@ -73,6 +71,46 @@ _UNITS = unsvec(np.eye(_ENTRIES))  # (10, 4, 4), whose svec are unit vectors
 
 
 @dataclass(frozen=True, eq=False)
+class Bounds:
+    """The points x with G x + h >= 0."""
+
+    G: Array  # (k, p)
+    h: Array  # (k,)
+    labels: tuple[str, ...]  # family and owner of each row, as "mass forearm"
+
+    def active(self, x: Array, tolerance: float) -> tuple[str, ...]:
+        """Return the labels of the rows that are active at x (p,)."""
+        return tuple(self.labels[k] for k in np.flatnonzero(self.G @ x + self.h < tolerance))
+
+
+@dataclass(frozen=True, eq=False)
+class Subspace:
+    """The subspace x = origin + basis y of the points that meet equalities."""
+
+    origin: Array  # (p,), a point that meets them
+    basis: Array  # (p, r), free directions, orthonormal
+
+    @classmethod
+    def of(cls, E: Array, e: Array) -> "Subspace":
+        """Return the points with E x = e, in the least squares sense: E (k, p), e (k,)."""
+        p = E.shape[1]
+        if not len(E):
+            return cls(np.zeros(p), np.eye(p))
+        is_free = ~E.any(axis=0)
+        inner = scipy.linalg.null_space(E[:, ~is_free])
+        basis = np.zeros((p, is_free.sum() + inner.shape[1]))
+        basis[is_free, : is_free.sum()] = np.eye(is_free.sum())
+        basis[~is_free, is_free.sum() :] = inner
+        return cls(np.linalg.lstsq(E, e, rcond=None)[0], basis)
+
+    @cached_property
+    def fixed(self) -> Array:
+        """Fixed directions, shape (p, p - r), orthonormal."""
+        p, r = self.basis.shape
+        return np.asarray(np.zeros((p, 0)) if r == p else scipy.linalg.null_space(self.basis.T))
+
+
+@dataclass(frozen=True, eq=False)
 class Minimum:
     """A minimum x (p,) with the multipliers of the inequalities (k,)."""
 
@@ -87,11 +125,9 @@ class Entropic:
     """2 sum_i d(J_i || P_i) of the bodies plus |(pi - centre) / std|^2 of the drives.
 
     d(J || P) = tr(P^-1 J) - log det(P^-1 J) - 4 is the Bregman divergence of -log det. It does not
-    depend on the frame of a body; near the prior the penalty is about |delta / std|^2.
-
-    References:
-        Lee, Wensing, Park (2019), Geometric robot dynamic identification: a convex programming
-        approach, (22), (24), (32).
+    depend on the frame of a body; near the prior the penalty is about |delta / std|^2. Lee,
+    Wensing, Park (2019), Geometric robot dynamic identification: a convex programming approach,
+    (22), (24), (32).
     """
 
     centre: Array  # (p,), prior values
@@ -117,7 +153,7 @@ class Entropic:
     def value(self, pi: Array) -> float:
         """Return the penalty, at least 0; infinite if a body is singular: pi (p,)."""
         values = np.linalg.eigvalsh(self._ratio(pi))  # of P^-1 J
-        if (values[:, 0] <= _SINGULAR * np.maximum(values[:, 3], 1.0)).any():
+        if (values[:, 0] <= ROUNDING * np.maximum(values[:, 3], 1.0)).any():
             return float("inf")
         divergence = (values - np.log(values) - 1.0).sum()
         return float(2.0 * divergence + self.precision @ self._drives(pi) ** 2)
@@ -134,7 +170,7 @@ class Entropic:
         The second derivative of a thin body is too ill conditioned to be factorised. With
         J = L L^T it is g_kl = tr(C_k C_l), C_k = L^-1 B_k L^-T, and S is computed from C.
         """
-        L = self._prior_factor @ np.linalg.cholesky(self._ratio(pi))
+        L = np.linalg.cholesky(self.prior) @ np.linalg.cholesky(self._ratio(pi))
         C = _whitened(pseudo_inertia_basis()[None], L[:, None])  # (n, 10, 4, 4)
         bodies = np.linalg.qr(svec(C).mT, mode="r")
         return np.asarray(scipy.linalg.block_diag(*bodies, np.diag(np.sqrt(self.precision))))
@@ -149,13 +185,9 @@ class Entropic:
         """The pseudo-inertias P of the prior without the known parts, shape (n, 4, 4)."""
         return self._rest(self.centre)
 
-    @cached_property
-    def _prior_factor(self) -> Array:
-        return np.linalg.cholesky(self.prior)
-
     def _ratio(self, pi: Array) -> Array:
         """Return L^-1 J L^-T of each body, dimensionless, 1 at the prior P = L L^T."""
-        return _whitened(self._rest(pi), self._prior_factor)
+        return _whitened(self._rest(pi), np.linalg.cholesky(self.prior))
 
     def _rest(self, pi: Array) -> Array:
         return pseudo_inertia(pi[: len(self.held)] - self.held)
@@ -189,28 +221,22 @@ class Programme:
         starts: Sequence[Minimum] | None = None,
     ) -> list[Minimum]:  # fmt: skip
         """Return the minimum of each of f data sets, as ``minimise``: rows (f, k, b + 1)."""
-        tolerance = _EXACT if is_exact else _ROUGH
-        if starts is not None:
-            starts = [replace(start, x=start.x / self.scale) for start in starts]
         A, d = rows[:, :, :-1] @ (self.K * self.scale), rows[:, :, -1]
         minima: list[Minimum] = []
         most = max(1, _TOGETHER // A[0].size)
         for k in (slice(first, first + most) for first in range(0, len(A), most)):
-            near = None if starts is None else starts[k]
-            minima += self._descended(A[k], d[k], weight, tolerance, near)
-        return [replace(minimum, x=minimum.x * self.scale) for minimum in minima]
+            if starts is None:
+                point = self._first(A[k], d[k], weight)
+            else:
+                point = self._near(starts[k], weight)
+            minima += self._descended(point, A[k], d[k], weight, _EXACT if is_exact else _ROUGH)
+        return minima
 
     def _descended(
-        self,
-        A: Array,
-        d: Array,
-        weight: float,
-        tolerance: float,
-        starts: Sequence[Minimum] | None = None,
+        self, point: "_Point", A: Array, d: Array, weight: float, tolerance: float
     ) -> list[Minimum]:
-        """Return the minimum of each data set: A (f, m, p), d (f, m)."""
-        point = self._first(A, d, weight) if starts is None else self._near(starts, weight)
-        found: dict[int, Minimum] = {}
+        """Return the minimum of each data set from a point: A (f, m, p), d (f, m)."""
+        minima: dict[int, Minimum] = {}
         left = np.arange(len(A))  # data sets that have not converged
         for step in range(1, _MOST + 1):
             try:
@@ -224,9 +250,10 @@ class Programme:
                 length = np.minimum(share, _BACK * system.bodies_to_boundary(ahead))
                 x, name = point.x + length[:, None] * ahead.x, f"interior point, {step} steps"
                 for k in np.flatnonzero(settled):
-                    found[left[k]] = Minimum(x[k], point.multipliers[k], step, name)
+                    x_k = x[k] * self.scale
+                    minima[left[k]] = Minimum(x_k, point.multipliers[k], step, name)
             if settled.all():
-                return [found[k] for k in range(len(found))]
+                return [minima[k] for k in range(len(minima))]
             point = system.corrected(ahead, share)
             if settled.any():
                 A, d, left, point = A[~settled], d[~settled], left[~settled], point.of(~settled)
@@ -259,8 +286,8 @@ class Programme:
     def bodies(self, x: Array) -> Array:
         """Return the pseudo-inertias without the known parts, shape (f, n, 4, 4): x (f, p)."""
         scale = self.scale[: self.inertial]
-        own = (x[:, : self.inertial] - self.penalty.held / scale) * scale
-        J: Array = own.reshape(len(x), -1, _ENTRIES) @ _BASIS
+        pi = (x[:, : self.inertial] - self.penalty.held / scale) * scale
+        J: Array = pi.reshape(len(x), -1, _ENTRIES) @ _BASIS
         return J.reshape(*J.shape[:2], _SIZE, _SIZE)
 
     def _first(self, A: Array, d: Array, weight: float) -> "_Point":
@@ -272,9 +299,8 @@ class Programme:
 
     def _near(self, starts: Sequence[Minimum], weight: float) -> "_Point":
         """Return points near minima."""
-        x, multipliers = (
-            np.array([getattr(s, key) for s in starts]) for key in ("x", "multipliers")
-        )
+        x = np.array([start.x / self.scale for start in starts])
+        multipliers = np.array([start.multipliers for start in starts])
         t = np.full((len(x), 1), weight)
         return self._centred(x, multipliers, t, _WARM * t, weight)
 
@@ -300,15 +326,13 @@ class Programme:
         draws: int,
         rng: np.random.Generator,
     ) -> tuple[Array, list[str]]:
-        """Return the distances of fits to resampled data and prior from this fit, and failures.
+        """Return the distances (m, p) of fits to resampled data and prior, and failures.
 
-        Noise of the data has the covariance of their score. Noise of the prior has the covariance
-        of the plausible prior. Both move the minimum without the inequalities, with the penalty
-        expanded at the fit; the nearest point within the bounds, in the metric of the fit, is the
-        minimum with them (Bardsley, Fox, 2012, An MCMC method for uncertainty quantification in
-        nonnegativity constrained inverse problems, section 3).
-
-        rows (k, b + 1), pi (p,), meat (b, b) -> (m, p).
+        Noise of the data has the covariance of their score, meat (b, b). Noise of the prior has the
+        covariance of the plausible prior. Both move the minimum pi (p,) of rows (k, b + 1) without
+        the inequalities, with the penalty expanded at the fit; the nearest point within the bounds,
+        in the metric of the fit, is the minimum with them (Bardsley, Fox, 2012, An MCMC method for
+        uncertainty quantification in nonnegativity constrained inverse problems, section 3).
         """
         S, space = self._scaled_root(pi), self.space
         L = np.sqrt(weight) * S  # half the Hessian of the weighted penalty is L^T L
@@ -340,20 +364,14 @@ class Programme:
 
     def whitened(self, rows: Array) -> tuple[Array, Array]:
         """Return A (k, m), r (k,), r = A x + noise, for coordinates x whose prior is N(0, 1)."""
-        beta, M = self._plausible
-        return rows[:, :-1] @ M, rows[:, -1] - rows[:, :-1] @ beta
-
-    @cached_property
-    def _plausible(self) -> tuple[Array, Array]:
-        """Prior of the base parameters, beta + M x, shapes (b,) and (b, m); see ``whitened``."""
-        centre, basis = self.centre, self.space.basis
+        basis, K = self.space.basis, self.K * self.scale
         S = self._scaled_root(self.penalty.centre)
         # the point of the subspace nearest to the centre
-        away = np.linalg.lstsq(S @ basis, S @ (centre - self.space.origin), rcond=None)[0]
-        nearest = self.space.origin + basis @ away
+        away = np.linalg.lstsq(S @ basis, S @ (self.centre - self.space.origin), rcond=None)[0]
+        beta = K @ (self.space.origin + basis @ away)
         L = scipy.linalg.qr(S @ basis, mode="r")[0][: basis.shape[1]]
-        K = self.K * self.scale
-        return K @ nearest, scipy.linalg.solve_triangular(L, (K @ basis).T, trans="T").T
+        M = scipy.linalg.solve_triangular(L, (K @ basis).T, trans="T").T
+        return rows[:, :-1] @ M, rows[:, -1] - rows[:, :-1] @ beta
 
     def covariance(
         self, weight: float, rows: Array | None = None, pi: Array | None = None
@@ -388,14 +406,14 @@ class _Point:
 
 @dataclass(frozen=True, eq=False)
 class _Direction:
-    """Steps; those of the bodies are in coordinates in which J and Z are diag(l)."""
+    """Steps, shaped as ``_Point``; of the bodies in coordinates in which J and Z are diag(l)."""
 
     z: Array  # (f, p)
-    x: Array  # (f, p)
-    J: Array  # (f, n, 4, 4)
-    Z: Array  # (f, n, 4, 4)
-    s: Array  # (f, k)
-    multipliers: Array  # (f, k)
+    x: Array
+    J: Array
+    Z: Array
+    s: Array
+    multipliers: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -408,18 +426,18 @@ class _Coordinates:
     @classmethod
     def of(cls, R: Array, problem: Programme, weight: float) -> "_Coordinates":
         moved = svec(R[:, :, None] @ _UNITS @ R.mT[:, :, None]) @ _TO_PARAMETERS
-        own = problem.scale[: problem.inertial].reshape(-1, _ENTRIES, 1)
-        return cls(moved.mT / own, 1.0 / (np.sqrt(weight) * problem.stiffness))
+        scale = problem.scale[: problem.inertial].reshape(-1, _ENTRIES, 1)
+        return cls(moved.mT / scale, 1.0 / (np.sqrt(weight) * problem.stiffness))
 
     def into(self, rows: Array) -> Array:
         """Return rows of coefficients of x as coefficients of z, shape (f, k, p)."""
         f, n = self.M.shape[:2]
         k, size = rows.shape[-2], _ENTRIES * n
         by_body = rows[..., :size].reshape(*rows.shape[:-1], n, _ENTRIES).swapaxes(-3, -2)
-        found = np.empty((f, k, rows.shape[-1]))
-        found[:, :, :size] = (by_body @ self.M).swapaxes(1, 2).reshape(f, k, size)
-        found[:, :, size:] = rows[..., size:] * self.drives
-        return found
+        in_z = np.empty((f, k, rows.shape[-1]))
+        in_z[:, :, :size] = (by_body @ self.M).swapaxes(1, 2).reshape(f, k, size)
+        in_z[:, :, size:] = rows[..., size:] * self.drives
+        return in_z
 
     def back(self, z: Array) -> Array:
         """Return x, shape (f, p)."""
@@ -492,9 +510,8 @@ class _System:
         right[:, :size] += svec(bodies).reshape(len(right), -1)
         z = self._solve(right)
         if self.N.shape[1]:
-            columns, small = self._held
             off = (point.x - self.problem.space.origin) @ self.problem.space.fixed
-            z = z - _times(columns @ np.linalg.inv(small), _times(self.N, z) + off)
+            z = z - _times(self._to_fixed, _times(self.N, z) + off)
         J = unsvec(z[:, :size]).reshape(bodies.shape)
         Z = bodies - J
         Z[..., _EYE, _EYE] -= length
@@ -503,10 +520,10 @@ class _System:
         return _Direction(z, self.coordinates.back(z), J, Z, s, multipliers)
 
     @cached_property
-    def _held(self) -> tuple[Array, Array]:
-        """Effect of the equalities' multipliers on a step, shape (f, p, e), and on equalities."""
+    def _to_fixed(self) -> Array:
+        """The smallest step, in the Hessian's metric, per violation of equalities, (f, p, e)."""
         columns = self._solve(self.N.mT)
-        return columns, self.N @ columns
+        return np.asarray(columns @ np.linalg.inv(self.N @ columns))
 
     def _solve(self, right: Array) -> Array:
         """Return the solutions of the equations of each point."""
@@ -517,7 +534,8 @@ class _System:
         """Return the points after a corrected step (Mehrotra's predictor and corrector)."""
         point, share = self.point, share[:, None]
         mean = (self.length**2).mean(axis=(1, 2))[:, None]
-        mu = _mean(point.multipliers * point.s)
+        products = point.multipliers * point.s
+        mu = products.sum(axis=1, keepdims=True) / max(products.shape[1], 1)
         left, crossed = (1.0 - share) ** 3, 0.5 * (ahead.J @ ahead.Z + ahead.Z @ ahead.J)
 
         def aimed(left: Array, trust: Array) -> tuple[_Direction, Array]:
@@ -529,7 +547,7 @@ class _System:
         step, length = aimed(left, share)
         short = length < np.minimum(_SHORT, 0.5 * share)
         if short.any():
-            left = np.where(short, np.maximum(left, _CENTRED), left)
+            left = np.where(short, np.maximum(left, _SHORT), left)
             step, length = aimed(left, np.where(short, 0.0, share))
         Z = self.R_inverse.mT @ step.Z @ self.R_inverse
         return _Point(
@@ -566,11 +584,6 @@ def _root(A: Array) -> Array:
     if info:
         raise np.linalg.LinAlgError(f"the Hessian is not positive definite in row {info}")
     return np.asarray(L)
-
-
-def _mean(x: Array) -> Array:
-    """Return the means along the last axis, which stays; 0 for an empty axis."""
-    return np.asarray(x.sum(axis=-1, keepdims=True) / max(x.shape[-1], 1))
 
 
 def _to_zero(x: Array, step: Array) -> Array:

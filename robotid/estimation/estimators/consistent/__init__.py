@@ -1,1 +1,0 @@
-"""The physically consistent fit: constraints of bodies, interior-point method, estimator."""

@@ -1,1 +1,0 @@
-"""Parallel processing of long logs: worker processes, Dask clusters, checkpoints of fleets."""
