@@ -64,24 +64,6 @@ def test_differences_are_in_combined_standard_errors(folder):
     assert sizes == sorted(sizes, reverse=True)
 
 
-def test_errors_of_the_same_recording_stand_side_by_side(folder):
-    a, b = (read_result(folder / f"{name}.json") for name in "ab")
-    found = compare_results([folder / "a.json", folder / "b.json"])
-    assert found["notes"] == []
-    assert found["fitted_alike"]
-    (entry,) = found["validation"]
-    for joint in entry["per_joint"]:
-        assert joint["relative_error_pct"] == [
-            r["validation"][0]["per_joint"][joint["joint"]]["relative_error_pct"] for r in (a, b)
-        ]
-    assert [r["verdict"] for r in found["results"]] == [a["verdict"], b["verdict"]]
-    names = [row["name"] for row in found["settings"]]
-    assert "estimator.name" in names
-    assert not {"identification", "validation", "urdf"} & set(names)
-    assert found["versions"] == []
-    assert all(all(row["in"]) for row in found["inputs"])
-
-
 def test_another_recording_is_not_compared(changed):
     def other_log(result):
         result["inputs"][-1]["sha256"] = "0" * 64

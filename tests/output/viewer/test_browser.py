@@ -8,11 +8,9 @@ import pinocchio as pin
 import pytest
 from helpers.browsing import until
 from helpers.browsing import visit as visit_large
-from helpers.paths import URDF
 from PIL import Image
 
 from robotid.output.viewer.replays import Bands, Mark, Torques, replay
-from robotid.robot.model import RobotModel
 
 T = np.arange(401) / 100.0 + 7.0  # [s]
 OPEN = {"reduced_motion": "reduce"}  # opens with the clock stopped
@@ -82,12 +80,6 @@ def playing(opened):
     yield opened
     opened.page.evaluate("replay.pause()")
     assert opened.errors == []
-
-
-@pytest.fixture(scope="module")
-def planar():
-    """A robot without meshes, where it does not matter which: it is drawn faster."""
-    return RobotModel.from_urdf(URDF / "planar_2r.urdf")
 
 
 @contextmanager
