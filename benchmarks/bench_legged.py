@@ -45,7 +45,7 @@ from robotid.cli.job import read_job
 from robotid.data.base_motion import BaseMotion
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.logs.contacts import check_base
+from robotid.diagnosis.logs.base_checks import check_base
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import compress
 from robotid.dynamics.used_rows import base_problem

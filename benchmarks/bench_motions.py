@@ -26,7 +26,7 @@ from bench_excitation import identified, must, record
 
 from robotid.design.basis import DesignedMotion, FourierBasis
 from robotid.design.design import Designer
-from robotid.design.motion_files import write_motion
+from robotid.design.excitation import write_motion
 from robotid.design.limits import MotionLimits
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

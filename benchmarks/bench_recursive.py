@@ -263,7 +263,7 @@ def exact_steps():
 
 
 def problem_of(block, D, mapping, model):
-    support = model.support()[:, mapping.independent]
+    support = model.support[:, mapping.independent]
     return Problem(lambda: iter([block]), mapping.base_names, 6, support, lambda: iter([D]))
 
 

@@ -22,7 +22,7 @@ import robotid
 from robotid.cli import COMMANDS, main
 from robotid.cli.job import job_from_settings
 from robotid.data.files.read import write_log
-from robotid.design.motion_files import write_motion
+from robotid.design.excitation import write_motion
 from robotid.dynamics.prediction import predict_instants
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Simulation

@@ -3,17 +3,6 @@
 from collections.abc import Sequence
 from typing import Any
 
-__all__ = [
-    "DataError",
-    "MissingDependencyError",
-    "ModelError",
-    "NotConvergedError",
-    "RankDeficientError",
-    "RobotIdError",
-    "SettingsError",
-    "WorkerError",
-]
-
 
 class RobotIdError(Exception):
     """Base class of all errors of robotid; they can be sent between processes."""
@@ -27,14 +16,10 @@ class ModelError(RobotIdError, ValueError):
 
 
 class DataError(RobotIdError, ValueError):
-    """A log or an array lacks required data or has invalid data.
-
-    Attributes:
-        code: A fixed word for the fault.
-    """
+    """A log or an array lacks required data or has invalid data."""
 
     def __init__(self, message: str, code: str = "unusable_log") -> None:
-        self.code = code
+        self.code = code  # a fixed word for the fault
         super().__init__(message)
 
 
@@ -43,18 +28,12 @@ class SettingsError(RobotIdError, ValueError):
 
 
 class RankDeficientError(RobotIdError):
-    """The data do not determine every parameter.
-
-    Attributes:
-        rank: Number of parameters that the data determine.
-        undetermined: Names of the other parameters.
-        total: Number of parameters.
-    """
+    """The data do not determine every parameter."""
 
     def __init__(self, rank: int, undetermined: Sequence[str], total: int, words: str = "") -> None:
-        self.rank = rank
-        self.undetermined = tuple(undetermined)
-        self.total = total
+        self.rank = rank  # number of parameters that the data determine
+        self.undetermined = tuple(undetermined)  # names of the others
+        self.total = total  # number of parameters
         super().__init__(
             f"the data excite {rank} of {total} base parameters; undetermined: "
             f"{', '.join(self.undetermined)}{f' ({words})' if words else ''}. Record a motion with "
@@ -64,14 +43,10 @@ class RankDeficientError(RobotIdError):
 
 
 class NotConvergedError(RobotIdError):
-    """An iteration or a solver stopped without a solution.
-
-    Attributes:
-        status: The status of the solver.
-    """
+    """An iteration or a solver stopped without a solution."""
 
     def __init__(self, message: str, status: str) -> None:
-        self.status = status
+        self.status = status  # of the solver
         super().__init__(f"{message} (status: {status})")
 
 
@@ -80,14 +55,10 @@ class WorkerError(RobotIdError):
 
 
 class MissingDependencyError(RobotIdError, ImportError):
-    """An optional package is not installed.
-
-    Attributes:
-        package: The package that is missing.
-    """
+    """An optional package is not installed."""
 
     def __init__(self, purpose: str, package: str, extra: str) -> None:
-        self.package = package
+        self.package = package  # that is missing
         super().__init__(
             f"{purpose} needs {package}, which is not installed: pip install '.[{extra}]' in a "
             f"checkout of robotid, or pip install 'robotid[{extra}]' where an index has it"

@@ -21,6 +21,14 @@ _log = logging.getLogger(__name__)
 
 #: The description of a LeRobot dataset, in its folder.
 DATASET = Path("meta") / "info.json"
+#: Files of results, which name the other files that were written with them.
+_RECORDS = ("result.json", "track.json", "fleet.json")
+_PAGES = ("report.html", "replay.html")  # beside a result
+_MARKS = 10**6  # [ns] of a modification time that are a mark
+_LONGEST = 255  # bytes of a file's name
+_LONGEST_PATH = 4095  # bytes of a whole path
+_SHOWN = 60  # characters of a name in a message
+_DEEPEST = 40  # levels of tables and lists
 
 
 def check_path(path: str | Path) -> None:
@@ -133,16 +141,6 @@ def _marked(path: Path) -> None:
     os.utime(path, ns=(times.st_atime_ns, written))
 
 
-#: Files of results, which name the other files that were written with them.
-_RECORDS = ("result.json", "track.json", "fleet.json")
-_PAGES = ("report.html", "replay.html")  # beside a result
-_MARKS = 10**6  # [ns] of a modification time that are a mark
-_LONGEST = 255  # bytes of a file's name
-_LONGEST_PATH = 4095  # bytes of a whole path
-_HIDDEN = 32  # further bytes in the name of a hidden file
-_SHOWN = 60  # characters of a name in a message
-
-
 @contextmanager
 def written_whole(target: str | Path, inputs: Iterable[str | Path | None] = ()) -> Iterator[Path]:
     """Provide a hidden name beside a file; what is written there then replaces the file.
@@ -161,7 +159,8 @@ def written_whole(target: str | Path, inputs: Iterable[str | Path | None] = ()) 
             except BrokenPipeError as error:
                 raise DataError(f"the reader of {str(path)!r} closed it before the end") from error
         return
-    hidden = path.with_name(_hidden(path.name))
+    name = hashlib.sha256(os.fsencode(path.name)).hexdigest()[:16]  # short, also of a long name
+    hidden = path.with_name(f".{name}.{os.getpid()}")
     try:
         yield hidden
         _marked(hidden)
@@ -171,13 +170,6 @@ def written_whole(target: str | Path, inputs: Iterable[str | Path | None] = ()) 
         raise
     finally:
         hidden.unlink(missing_ok=True)
-
-
-def _hidden(name: str) -> str:
-    """Return the temporary name of a file; a long name is replaced by its hash."""
-    digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
-    short = name if len(os.fsencode(name)) <= _LONGEST - _HIDDEN else digest
-    return f".{short}.{os.getpid()}"
 
 
 def _is_stream(path: Path) -> bool:
@@ -325,9 +317,6 @@ def moved_file(path: Path, result: Path, hashes: Collection[str]) -> Path:
             if log_exists(place) and file_sha256(place) in hashes:
                 return place
     return path
-
-
-_DEEPEST = 40  # levels of tables and lists
 
 
 @lru_cache(maxsize=1024)

@@ -16,31 +16,18 @@ _NAMES = ("joint", "joints", "link", "links", "channel", "setting", "flag")
 
 @dataclass(frozen=True)
 class Finding:
-    """A fault or a property that a user must know.
+    """A fault or a property that a user must know."""
 
-    Attributes:
-        code: A fixed word for programs.
-        severity: "note", "warning" or "error".
-        where: Its subject: a link, a joint, a parameter or a file.
-        message: The fault, the value found, the value expected, the remedy.
-        evidence: The numbers it depends on, by name.
-        log: The log concerned; empty if none.
-        joints: The joints concerned.
-        words: Texts of the message that are no numbers, by name.
-        fault: Template of the message, with slots for numbers and words; empty: it is the message.
-        remedy: Template of its second part.
-    """
-
-    code: str
-    severity: str
-    where: str
-    message: str
-    evidence: Mapping[str, float] = field(default_factory=dict)
-    log: str = ""
-    joints: tuple[str, ...] = ()
-    words: Mapping[str, str] = field(default_factory=dict)
-    fault: str = ""
-    remedy: str = ""
+    code: str  # a fixed word for programs
+    severity: str  # "note", "warning" or "error"
+    where: str  # its subject: a link, a joint, a parameter or a file
+    message: str  # the fault, the value found, the value expected, the remedy
+    evidence: Mapping[str, float] = field(default_factory=dict)  # numbers it depends on, by name
+    log: str = ""  # the log concerned
+    joints: tuple[str, ...] = ()  # the joints concerned
+    words: Mapping[str, str] = field(default_factory=dict)  # texts of the message, by name
+    fault: str = ""  # template of the message, with slots for numbers and words; if there is one
+    remedy: str = ""  # template of its second part
 
     def reworded(self, **changes: Any) -> "Finding":  # noqa: ANN401
         """Return the finding with other fields, and the message that follows from them."""
@@ -51,21 +38,13 @@ class Finding:
 
 @dataclass(frozen=True)
 class Cause:
-    """Findings of one code, which probably have a common cause.
-
-    Attributes:
-        code: The code.
-        severity: The highest severity of the findings.
-        joints: The joints concerned, in the order of the robot; none: the whole robot.
-        messages: Their messages; those that differ only in names and numbers are one sentence.
-        findings: The findings, by descending severity.
-    """
+    """Findings of one code, which probably have a common cause."""
 
     code: str
-    severity: str
-    joints: tuple[str, ...]
-    messages: tuple[str, ...]
-    findings: tuple[Finding, ...]
+    severity: str  # the highest of the findings
+    joints: tuple[str, ...]  # those concerned, in the order of the robot; none: the whole robot
+    messages: tuple[str, ...]  # those that differ only in names and numbers are one sentence
+    findings: tuple[Finding, ...]  # by descending severity
 
 
 def not_ignored(findings: Iterable[Finding], ignore: Iterable[str]) -> tuple[Finding, ...]:
@@ -107,8 +86,7 @@ def grouped(findings: Iterable[Finding], joints: Sequence[str] = ()) -> tuple[Ca
     for code, alike in by_code.items():
         about = {joint for finding in alike for joint in finding.joints or (finding.where,)}
         named = tuple(joint for joint in joints if joint in about)
-        messages = tuple(sentence(group) for group in _alike(alike))
-        messages = tuple(dict.fromkeys(messages))
+        messages = tuple(dict.fromkeys(map(sentence, _alike(alike))))
         causes.append(Cause(code, alike[0].severity, named, messages, tuple(alike)))
     return tuple(causes)
 

@@ -45,9 +45,7 @@ def require_each(
     is_list = isinstance(values, Collection) and not isinstance(values, str | bytes | Mapping)
     entries = list(values) if is_list and getattr(values, "ndim", 1) == 1 else [None]  # type: ignore[call-overload]
     if not all(isinstance(entry, kind) for entry in entries):
-        raise SettingsError(
-            f"{name} is {shown(values)}, a {type(values).__name__}, wanted {wanted}"
-        )
+        require_kind(values, (), name, wanted)
     return entries
 
 
@@ -67,6 +65,8 @@ def require_flag(value: object, name: str) -> None:
         require_kind(value, bool, name, "True or False")
 
 
+#: Settings and parameters are smaller, SI units: products of a few are finite.
+LARGEST_SETTING = 1e30
 #: Keys that are required in a table of a list of tables, if its schema has them.
 REQUIRED = ("log", "name", "ratios", "joints", "matrix", "mass", "frame", "frames")
 POSITIVE = Range("a positive number", lambda x: x > 0)
@@ -129,10 +129,10 @@ class Settings:
     @classmethod
     def schema(cls) -> dict[str, Any]:
         """Return the permitted keys of a job file: a type or types, a table, or [a table]."""
-        found: dict[str, Any] = {}
+        schema: dict[str, Any] = {}
         for f, key, (*tables, last) in cls.entries():
-            table_in(found, tables)[last] = _read_type(f.type if key.reads is None else key.reads)
-        return found
+            table_in(schema, tables)[last] = _read_type(f.type if key.reads is None else key.reads)
+        return schema
 
     @classmethod
     def paths(cls) -> dict[str, Key]:
@@ -232,7 +232,7 @@ def _check_entries(value: object, wanted: Entries, at: str) -> None:
 def _check_type(value: object, kinds: tuple[type, ...], at: str) -> None:
     if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
         raise SettingsError(f"{at} is {shown(value)}, wanted {_type_name(kinds)}")
-    if isinstance(value, int | float) and not abs(value) <= _LARGEST:  # NaN, too
+    if isinstance(value, int | float) and not abs(value) <= LARGEST_SETTING:  # NaN, too
         raise SettingsError(f"{at} is {shown(value)}, wanted a number between -1e30 and 1e30")
 
 
@@ -248,28 +248,18 @@ def shown(value: object) -> str:
 def _check_value(value: Any, key: Key, name: str) -> None:  # noqa: ANN401
     if value is None or not (key.among or key.within):
         return
-    words = [f"one of {listed(key.among)}"] if key.among else []
-    if key.within is None:
-        is_right = _is_so(lambda: value in key.among)
-    elif isinstance(value, str):
-        is_right, words = value in key.among, [key.within.words, *words]
-    else:
-        within = key.within
-        is_right, words = _is_so(lambda: within.holds(value)), [within.words]
-    if not is_right:
+    is_word = isinstance(value, str)
+    words = [] if key.within is None else [key.within.words]
+    words += [f"one of {listed(key.among)}"] if key.among and (is_word or not words) else []
+    try:
+        is_number = bool(key.within and not is_word and key.within.holds(value))
+    except (TypeError, ValueError):  # of a value for which the check is not made
+        is_number = False
+    if not (is_number or (is_word and value in key.among)):
         raise SettingsError(f"{name} is {shown(value)}, wanted {' or '.join(words)}")
 
 
-def _is_so(holds: Callable[[], Any]) -> bool:
-    """Return whether a check holds; it does not if it raises for a value."""
-    try:
-        return bool(holds())
-    except (TypeError, ValueError):
-        return False
-
-
 _NUMBER = (int, float)
-_LARGEST = 10**30  # settings are smaller; results of larger values may overflow
 _WORDS = {str: "text", bool: "true or false", list: "a list", dict: "a table"}
 _ALSO = {bool: "false", str: "text", list: "a list"}
 

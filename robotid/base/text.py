@@ -13,7 +13,7 @@ _ARGUMENT = re.compile(r"(?:'[^'\n]*'|[^\s'])+")  # of a command, with its quote
 _PATH = re.compile(r"'[^' ]*/[^'\n]*'")  # a quoted path, which may have blanks
 _UNIT = re.compile(r"(?<=\d) (?=%|(?:m?s|kg|N|m|Hz|rad)\b)")  # between a number and its unit
 _PLAIN = (-3, 6)  # powers of ten that are written without an exponent
-_GAP = 2  # blanks between columns
+_GAP = "  "  # between columns
 _NARROWEST = 40
 _YAML_WORDS = ("y", "n", "yes", "no", "on", "off", "true", "false", "null")  # not text in YAML 1.1
 _TONES = {"good": 32, "usable": 33, "poor": 31, "error": 31, "warning": 33}  # of ANSI terminals
@@ -37,8 +37,8 @@ def wrapped(text: str, width: int | None, indent: str = "") -> str:
     if width is None:
         return text
     lines = []
-    whole = _PATH.sub(lambda found: found.group().replace(" ", "\0"), _UNIT.sub("\0", text))
-    for line in whole.split("\n"):
+    text = _PATH.sub(lambda path: path.group().replace(" ", "\0"), _UNIT.sub("\0", text))
+    for line in text.split("\n"):
         indentation = line[: len(line) - len(line.lstrip())] + indent
         lines += textwrap.wrap(
             line,
@@ -79,7 +79,7 @@ def columns(
     sizes = [max(map(len, column)) for column in zip(*table, strict=True)]
     count = len(heads)
     while count > (len(heads) if needed is None else needed) and width is not None:
-        if sum(sizes[:count]) + _GAP * count <= width:
+        if sum(sizes[:count]) + len(_GAP) * count <= width:
             break
         count -= 1
     lines = []
@@ -88,7 +88,7 @@ def columns(
             cell.ljust(size) if k in left else cell.rjust(size)
             for k, (cell, size) in enumerate(zip(row[:count], sizes[:count], strict=True))
         ]
-        lines.append((" " * _GAP + (" " * _GAP).join(cells)).rstrip())
+        lines.append((_GAP + _GAP.join(cells)).rstrip())
     if count < len(heads):
         names = ", ".join(" ".join(head.split()) for head in heads[count:])
         lines.append(f"  in wider terminals: {names}")

@@ -21,9 +21,14 @@ from robotid.data.log import Log
 from robotid.design.basis import Basis, BSplineBasis, FourierBasis
 from robotid.design.clearance import Box, Clearance
 from robotid.design.design import Design, Designer
-from robotid.design.excitation_settings import FARTHEST, ROUTES, MotionSettings
+from robotid.design.excitation import (
+    FARTHEST,
+    ROUTES,
+    MotionSettings,
+    check_motion_file,
+    write_motion,
+)
 from robotid.design.limits import LIMITS, Course, MotionLimits
-from robotid.design.motion_files import check_motion_file, write_motion
 from robotid.design.previews import Preview, Run, preview_logs
 from robotid.design.routes import design_stands, design_sweeps
 from robotid.estimation.fitting.survey import hold_log

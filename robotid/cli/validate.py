@@ -28,10 +28,17 @@ from robotid.cli.job import Job, LogEntry, written_job
 from robotid.cli.logs import log_of_commands, survey_logs, units_of_logs
 from robotid.data.log import Log
 from robotid.diagnosis.logs.check_logs import diagnose
-from robotid.diagnosis.verdict.evidence import Determined, Predictions
 from robotid.diagnosis.verdict.fit_findings import unlike_findings
-from robotid.diagnosis.verdict.position_verdict import judge_positions
-from robotid.diagnosis.verdict.verdict import Verdict, VerdictWarning, blocking, judge, warnings_of
+from robotid.diagnosis.verdict.verdict import (
+    Determined,
+    Predictions,
+    Verdict,
+    VerdictWarning,
+    blocking,
+    judge,
+    judge_positions,
+    warnings_of,
+)
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.evaluation import (
     Evaluation,

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robotid.base.arguments import real_numbers
 from robotid.base.exceptions import DataError
 from robotid.base.findings import listed
-from robotid.base.typing import Array
+from robotid.base.typing import Array, real_numbers
 
 #: Names of the coordinates of a pose: position [m], and the orientation as a quaternion.
 POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")

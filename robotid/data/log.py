@@ -15,12 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from robotid.base.arguments import frozen, real_numbers
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.settings import is_number, require_each, require_flag, require_kind
 from robotid.base.text import seconds
-from robotid.base.typing import Array
+from robotid.base.typing import Array, frozen, real_numbers
 from robotid.data.base_motion import POSE, BaseMotion
 
 #: Attributes of a `Log` with one column per joint, by the prefix of these columns in files.

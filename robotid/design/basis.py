@@ -63,8 +63,7 @@ class FourierBasis(Basis):
     def _free(self) -> Array:
         """The sums of sines and cosines that are at rest at the ends, shape (2 h, 2 h - 2)."""
         k, none = np.arange(1.0, self.harmonics + 1), np.zeros(self.harmonics)
-        free: Array = scipy.linalg.null_space(np.array([np.r_[k, none], np.r_[none, k**2]]))
-        return free
+        return np.asarray(scipy.linalg.null_space([np.r_[k, none], np.r_[none, k**2]]))
 
     def derivatives(self, t: Array, order: int) -> Array:
         w = 2 * np.pi / self.duration * np.arange(1, self.harmonics + 1)
@@ -101,10 +100,10 @@ class BSplineBasis(Basis):
 
         inner = np.linspace(0.0, self.duration, self.pieces + 1)
         knots = np.r_[[0.0] * _DEGREE, inner, [self.duration] * _DEGREE]
-        all_of_them = BSpline(knots, np.eye(self.pieces + _DEGREE), _DEGREE)
+        splines = BSpline(knots, np.eye(self.pieces + _DEGREE), _DEGREE)
         out = np.empty((order + 1, len(t), self.size))
         for d in range(order + 1):
-            values = all_of_them(np.clip(t, 0.0, self.duration), nu=d)
+            values = splines(np.clip(t, 0.0, self.duration), nu=d)
             first, last = values[:, :3].sum(axis=1), values[:, -3:].sum(axis=1)
             free = np.column_stack([first, values[:, 3:-3], last])
             out[d] = np.column_stack([np.full(len(t), float(d == 0)), free[:, 1:]])

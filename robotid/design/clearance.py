@@ -21,21 +21,21 @@ from robotid.dynamics.simulation.motions import Motion
 from robotid.robot.geometry import link_clouds
 from robotid.robot.model import RobotModel
 
-#: Distance whose violation has the cost of a whole limit of the motion [m].
+#: Distance whose violation has the cost of a whole limit of the motion [m]; links that are farther
+#: apart in all random poses are checked in the end only.
 SOFT = 0.05
-_TRIED = 400  # random poses by which the pairs of links that may meet are found
-_DISTANT = 0.05  # [m] links whose distance is larger at all of them are checked in the end only
+#: Random poses by which the pairs of links that may meet are found, and static ones chosen.
+POSES = 400
 _ALMOST_ALL = 0.95  # share of the poses
-_TOUCH = 1e-3  # [m] hulls at a smaller distance touch
+_TOUCH = 1e-3  # [m] hulls at a smaller distance touch; a flat shape has this thickness
 _CLOSE = 5e-3  # [m] beyond the clearance: links within it are close by design
-_THINNEST = 1e-3  # [m] thickness given to a flat shape
 _FIRST = 0.05  # [s] the first intervals in which a motion is checked ...
 _SHORTEST = 1e-3  # [s] ... and the shortest
 _TOLERANCE = 5e-4  # [m] by which a lower bound may be too low
 _WIDE = 100.0  # [m] extent of the floor
-_SPARE = 0.002  # [m] reserve of distances for the motion between samples, but at most ...
-_SPARE_SHARE = 0.25  # ... this share of the slack of links that are close by design
-_EXACT = 0.01  # [m] margin below which distances are exact
+_SPARE = 0.002  # [m] reserve of distances for the motion between samples ...
+_EXACT = 0.01  # [m] ... and margin below which distances are exact, but both at most ...
+_SLACK = 0.25  # ... this share of the slack of links that are close by design
 
 
 @dataclass(frozen=True)
@@ -73,9 +73,9 @@ class Nearness:
     """Distances of near pairs along a motion."""
 
     distance: Array  # shape (pairs, N) [m]; a lower bound beyond the distance asked for
-    pairs: Array  # pair of each of k distances that have a gradient, shape (k,)
-    samples: Array  # sample of each, shape (k,)
-    gradient: Array  # of each by the n joints, shape (k, n) [m/rad or 1]
+    pairs: Array  # (k,), pair of each distance that has a gradient
+    samples: Array  # (k,), sample of each
+    gradient: Array  # (k, n), of each by the joints [m/rad or 1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,17 +97,15 @@ class Clearance:
     and in 95 % of random poses: they are in contact by design. Two links whose distance is smaller
     than the clearance in 95 % of the poses, but which do not always touch, are close by design:
     half their median distance is required.
-
-    Attributes:
-        pairs: Numbers of the two hulls of each pair.
-        likely: Which pairs may meet within the limits, shape (pairs,), bool.
-        required: Required distance of each pair, shape (pairs,) [m].
-        slack: Median distance beyond the required one of pairs that are close by design, shape
-            (pairs,) [m]; inf for the others.
-        unread: Links of which a shape cannot be read: they are not checked.
-        made_to: Links in contact by design, by two, with their smallest distance.
-        built_near: Links that are close by design, by two, with the required distance.
     """
+
+    pairs: Array  # (pairs, 2), numbers of the two hulls of each pair
+    likely: Array  # (pairs,), bool, which may meet within the limits
+    required: Array  # (pairs,), required distance [m]
+    slack: Array  # (pairs,), median distance beyond it of those close by design [m]; inf of others
+    unread: list[str]  # links of which a shape cannot be read: they are not checked
+    made_to: list[str]  # links in contact by design, by two, with their smallest distance
+    built_near: list[str]  # links that are close by design, by two, with the required distance
 
     def __init__(
         self,
@@ -143,20 +141,20 @@ class Clearance:
         """Return pairs that can move against each other: not links that a joint joins."""
         tree, hulls = self._model.pin_model, self._hulls
         joined = {(int(tree.parents[i]) - 1, i - 1) for i in range(1, tree.njoints)}
-        found = []
+        pairs = []
         for i, j in combinations(range(len(hulls)), 2):
             a, b = sorted((hulls[i].body, hulls[j].body))
             is_link = hulls[j].name in self._model.tree.links
             if a != b and not (is_link and (a, b) in joined):
-                found.append((i, j))
-        return np.array(found, dtype=int).reshape(-1, 2)
+                pairs.append((i, j))
+        return np.array(pairs, dtype=int).reshape(-1, 2)
 
     def _classify(self, rng: np.random.Generator) -> None:
         """Find by random poses which pairs may meet, are in contact, or are close by design."""
         low = [j.lower if j.has_limits else -np.pi for j in self._model.limits]
         high = [j.upper if j.has_limits else np.pi for j in self._model.limits]
-        q = np.vstack([np.clip(0.0, low, high), rng.uniform(low, high, (_TRIED, len(low)))])
-        distance = self.near(self.placed(q), self.least + _DISTANT, self.everything).distance
+        q = np.vstack([np.clip(0.0, low, high), rng.uniform(low, high, (POSES, len(low)))])
+        distance = self.near(self.placed(q), self.least + SOFT, self.everything).distance
         is_link = np.array([hull.name in self._model.tree.links for hull in self._hulls])
         are_links = np.all(is_link[self.pairs], axis=1)
         touch = np.less(distance, _TOUCH)
@@ -171,7 +169,7 @@ class Clearance:
             self.required[k] = min(self.least, median / 2)
             self.slack[k] = median - self.required[k]
         self.built_near = self._listed(near, self.required)
-        distant = self.required + np.minimum(_DISTANT, self.slack / 2)
+        distant = self.required + np.minimum(SOFT, self.slack / 2)
         self.likely = distance.min(axis=1, initial=np.inf) < distant
 
     def _listed(self, chosen: Array, distance: Array) -> list[str]:
@@ -194,8 +192,7 @@ class Clearance:
     @cached_property
     def movers(self) -> Array:
         """Which joints move the hulls of each pair against each other, shape (pairs, n), bool."""
-        moved: Array = (self._levers > 0.0) @ np.abs(self._ratios) > 0.0
-        return moved
+        return np.asarray((self._levers > 0.0) @ np.abs(self._ratios) > 0.0)
 
     @property
     def everything(self) -> Array:
@@ -210,13 +207,12 @@ class Clearance:
     @property
     def spare(self) -> Array:
         """Reserve of the distances for the motion between samples, shape (pairs, 1) [m]."""
-        spare: Array = np.minimum(_SPARE, _SPARE_SHARE * self.slack)[:, None]
-        return spare
+        return np.minimum(_SPARE, _SLACK * self.slack)[:, None]
 
     def margins(self, placed: Placements, spare: float) -> Array:
         """Return margins of distances, shape (pairs, N) [m]; a lower bound of those over 1 cm."""
         required = self.required[:, None] + spare * self.spare
-        exact = np.minimum(_EXACT, self.slack[:, None] / 4)
+        exact = np.minimum(_EXACT, _SLACK * self.slack)[:, None]
         return self.near(placed, required + exact).distance - required
 
     def placed(self, q: Array) -> Placements:
@@ -227,7 +223,6 @@ class Clearance:
         self, placed: Placements, within: float | Array, chosen: Array | None = None
     ) -> Nearness:
         """Return the distances of pairs along a motion, exact where they are near."""
-        # within (pairs, N) [m], chosen (pairs,)
         import coal
 
         chosen = self.likely if chosen is None else chosen
@@ -265,7 +260,7 @@ class Clearance:
         References:
             Schwarzer, Saha, Latombe (2005), Adaptive dynamic collision checking for robots.
         """
-        smallest, required = _DISTANT, self.required[:, None]  # smallest: margin so far
+        smallest, required = SOFT, self.required[:, None]  # smallest: margin so far
         lowest, nearest = smallest, None
         h = duration / max(2, round(duration / _FIRST)) / 2
         middles = np.arange(h, duration, 2 * h)
@@ -289,8 +284,8 @@ class Clearance:
         if nearest is None:
             return None
         pair, time = nearest
-        own = float(self.required[pair])
-        return Contact(*self.named[pair], min(lowest, smallest) + own, time, own)
+        least = float(self.required[pair])
+        return Contact(*self.named[pair], min(lowest, smallest) + least, time, least)
 
     @cached_property
     def _levers(self) -> Array:
@@ -326,16 +321,12 @@ class Clearance:
         return bound
 
     def _between_boxes(self, hulls: Array, centres: Array, rotations: Array) -> Array:
-        """Return the largest gaps of k pairs of boxes along one of their sides, (k,) [m].
-
-        hulls (2, k), centres (2, k, 3), rotations (2, k, 3, 3).
-        """
+        """Return the largest gaps of k pairs of boxes along one of their sides, (k,) [m]."""
         half = np.array([hull.half for hull in self._hulls])[hulls]  # (2, k, 3)
         sides = np.concatenate([*rotations], axis=2).swapaxes(1, 2)  # (k, 6, 3)
         reach = np.abs(sides @ rotations) @ half[..., None]  # (2, k, 6, 1)
         gaps = np.abs(sides @ (centres[1] - centres[0])[..., None]) - reach.sum(axis=0)
-        largest: Array = gaps.max(axis=(1, 2), initial=-np.inf)
-        return largest
+        return np.asarray(gaps.max(axis=(1, 2), initial=-np.inf))
 
     @cached_property
     def _bodies(self) -> Array:
@@ -368,8 +359,7 @@ class Clearance:
             levers = np.cross(axes, points[side][:, None] - origins)
             along = np.einsum("kjc,kc->kj", np.where(prismatic, axes, levers), normals)
             out += sign * np.where(self._supports[bodies[:, side]], along, 0.0)
-        by_joint: Array = out @ self._ratios
-        return by_joint
+        return np.asarray(out @ self._ratios)
 
 
 def _hull(name: str, body: int, points: Array) -> _Hull:
@@ -381,9 +371,9 @@ def _hull(name: str, body: int, points: Array) -> _Hull:
     about = points - centre
     radius = float(np.linalg.norm(about, axis=1).max())
     extent = np.ptp(about, axis=0)  # the centre is the middle of it
-    is_flat = np.linalg.matrix_rank(about, tol=_THINNEST) < 3
+    is_flat = np.linalg.matrix_rank(about, tol=_TOUCH) < 3
     if is_flat or (len(points) == 8 and np.allclose(np.abs(about), extent / 2)):
-        extent, radius = np.maximum(extent, _THINNEST), radius + is_flat * _THINNEST
+        extent, radius = np.maximum(extent, _TOUCH), radius + is_flat * _TOUCH
         return _Hull(name, body, centre, radius, extent / 2, coal.Box(*extent))
     corners = np.unique(np.round(about, 6), axis=0)
     corners = corners[ConvexHull(corners).vertices]

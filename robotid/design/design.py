@@ -39,8 +39,7 @@ _GROWTH = 3.0  # of the weight from one round to the next
 _PER_PERIOD = 14  # samples of the grid within the shortest period of a basis
 _POLISHED = 3  # times as many in the last rounds ...
 _FINER = 15  # ... and in the final check of the limits
-_ROUNDS = 14  # of the augmented Lagrangian ...
-_LAST_ROUNDS = 8  # ... and on the finer grid
+_ROUNDS = 14  # of the augmented Lagrangian
 _STEPS = 20  # of L-BFGS in each
 _WEIGHT = 3.0  # initial weight of the violations of all samples together
 _LESS = 0.25  # share of a round's violation: the weight increases if the next violation exceeds it
@@ -52,8 +51,7 @@ _TRIALS = 10  # shares of a motion tried for the largest that satisfies the limi
 _SHARE = 1e-3  # ... to this accuracy, or as near to a limit
 _TYPICAL = 0.3  # of the largest torque, speed and acceleration: about the RMS of a motion
 _WIDEST = 0.25  # share of the base parameters in the criterion "widest"
-#: Random motions of which the best is a start.
-STARTED = 10
+_STARTED = 10  # random motions of which the best is a start
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,29 +67,21 @@ class Multipliers:
         limits, distances = _between(self.limits, times), _between(self.distances, times)
         return Multipliers(self.weight / times, limits, distances)
 
-    def increased(self) -> "Multipliers":
-        """Return the same with a larger weight."""
-        return replace(self, weight=_GROWTH * self.weight)
-
     def raised(self, used: Array, distance: Array | None, aim: Array) -> "Multipliers":
         """Return the slopes as the new multipliers."""
-        # used (6, N, n), distance (pairs, N) [m], aim (pairs, 1) [m]
         distances = 0.0 if distance is None else self.of_distances(distance, aim)[1]
         return replace(self, limits=self.of_limits(used)[1], distances=distances)
 
     def of_limits(self, used: Array) -> tuple[float, Array]:
         """Return the cost of limits and its derivative by their violations, shape (6, N, n)."""
-        # used (6, N, n)
         return self._cost(used**2 / (1.0 - SPARE) ** 2 - 1.0, self.limits)
 
     def of_distances(self, distance: Array, aim: Array) -> tuple[float, Array]:
         """Return the cost of distances and its derivative by their deficits, shape (pairs, N)."""
-        # distance (pairs, N) [m], aim (pairs, 1) [m]
         return self._cost((aim - distance) / SOFT, self.distances)
 
     def distance_without_cost(self, aim: Array) -> Array:
-        """Return the distances from which there is no cost, shape (pairs, N) or (pairs, 1) [m]."""
-        # aim (pairs, 1) [m]
+        """Return the distances from which there is no cost: aim (pairs, 1) [m]."""
         return aim + SOFT / self.weight * self.distances
 
     def _cost(self, over: Array, multipliers: Array | float) -> tuple[float, Array]:
@@ -108,8 +98,7 @@ def _between(values: Array | float, times: int) -> Array | float:
     steps = np.diff(values, axis=1)[:, :, None]
     shape = len(values), times * (values.shape[1] - 1), *values.shape[2:]  # maybe of no pair
     between = (values[:, :-1, None] + share * steps).reshape(shape)
-    fine: Array = np.concatenate([between, values[:, -1:]], axis=1) / times
-    return fine
+    return np.concatenate([between, values[:, -1:]], axis=1) / times
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,16 +109,13 @@ class Design:
     duration: float  # its length [s]
     intervals: int  # number of equal intervals between the samples at which its limits were checked
     objective: float  # its criterion, the smaller the better
-    #: Condition number of the base problem, columns in units of the prior deviations.
-    condition: float
-    #: Largest used share of each limit, by joint, shape (6, n); 0 where there is no limit.
-    used: Array
+    condition: float  # of the base problem, columns in units of the prior deviations
+    used: Array  # (6, n), largest used share of each joint's limit; 0 where there is none
     contact: Contact | None = None  # where the smallest distance is; None if no pair comes near
     seconds: float = 0.0  # computing time [s]
     starts: int = 0  # number of completed starts
     is_converged: bool = False  # whether the best of them has converged
-    #: Computing time [s] and criterion of each better motion.
-    history: tuple[tuple[float, float], ...] = ()
+    history: tuple[tuple[float, float], ...] = ()  # computing time [s], criterion of better ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,9 +136,7 @@ class Designer:
     information: MotionInformation  # the rows of the base problem, and their gradient
     limits: MotionLimits  # the robot's limits
     basis: Basis  # basis functions of the motion
-    #: Density of each joint's noise, variance times the time over which it is correlated,
-    #: shape (n,) [(N m)^2 s or N^2 s].
-    noise: Array
+    noise: Array  # (n,), density: variance times its correlation time [(N m)^2 s or N^2 s]
     spread: Array  # prior deviations of the base parameters, shape (b,)
     given: Array | None = None  # prior information, shape (b, b), in units of the spread; 1 if None
     name: str = "D"  # the criterion, as of ``criterion``
@@ -173,7 +157,6 @@ class Designer:
         run: Run | None = None,
     ) -> "Designer":
         """Return a designer with the assumptions of a preview on friction and noise."""
-        criterion(name, np.eye(1))
         mapping = structural_mapping(model)
         size, speed = largest_torques(model, largest_gravity(model)), limits.sizes[1]
         pi = assumed_parameters(model, size, speed) if run is None else run.standard
@@ -210,10 +193,9 @@ class Designer:
         def is_over() -> bool:
             return bool(history) and time.monotonic() - began > seconds
 
-        def follow(designer: Designer, state: State, rounds: int, settled: float) -> State:
-            """Return the end of the search from a start."""
+        def follow(designer: Designer, state: State, settled: float) -> State:
             nonlocal best
-            for state in designer._search(state, rounds, settled, is_over):  # noqa: B020
+            for state in designer._search(state, settled, is_over):  # noqa: B020
                 if state.objective < best:
                     best = state.objective
                     history.append((time.monotonic() - began, best))
@@ -222,20 +204,19 @@ class Designer:
             return state
 
         while len(followed) < starts and not is_over():
-            random = [self.random(rng) for _ in range(STARTED)]
+            random = [self.random(rng) for _ in range(_STARTED)]
             objective, k = min((self._objective(C), k) for k, C in enumerate(random))
             multipliers = Multipliers(_WEIGHT / self._functions.shape[1])
             initial = State(random[k], objective, random[k], multipliers)
-            followed.append(follow(self, initial, _ROUNDS, _NEARLY))
+            followed.append(follow(self, initial, _NEARLY))
         chosen = min(followed, key=lambda state: state.objective)
         fine, best = replace(self, finer=_POLISHED * self.finer), np.inf
         feasible = fine._feasible(chosen.feasible, 1.0 - SPARE)
         multipliers = chosen.multipliers.finer(_POLISHED)
         initial = State(feasible, fine._objective(feasible), chosen.iterate, multipliers)
-        polished = follow(fine, initial, _LAST_ROUNDS, _SETTLED)
-        found = replace(self, finer=_FINER * self.finer).checked(polished.feasible)
+        polished = follow(fine, initial, _SETTLED)
         return replace(
-            found,
+            replace(self, finer=_FINER * self.finer).checked(polished.feasible),
             seconds=time.monotonic() - began,
             starts=len(followed),
             is_converged=polished.is_settled,
@@ -244,11 +225,11 @@ class Designer:
 
     def checked(self, C: Array) -> Design:
         """Return a motion, scaled down until it satisfies all limits, also between the samples."""
-        # C (h, n)
         C, contact = self._clear(self._feasible(C, 1.0))
         used, _, rows = self._constraints(C)
         information = self.matrix(rows)
-        return self._assessed(self._motion(C), self.basis.duration, information, used, contact)
+        motion = DesignedMotion(self.basis, C)
+        return self._assessed(motion, self.basis.duration, information, used, contact)
 
     def examined(self, motion: Motion, duration: float, rate: float) -> Design:
         """Return the criterion of any motion, and its use of the limits other than jerk."""
@@ -259,10 +240,7 @@ class Designer:
         return self._assessed(motion, duration, information, used, contact)
 
     def course(self, design: Design) -> Course:
-        """Return the course of a design at the samples at which its limits were checked.
-
-        The torque is the one that its design assumes.
-        """
+        """Return the course of a design where its limits were checked, with its assumed torque."""
         t = np.linspace(0.0, design.duration, design.intervals + 1)
         q, v, a = design.motion.evaluate(t)
         torque = self.information.torque(self.information.rows(q, v, a))
@@ -277,10 +255,6 @@ class Designer:
         rows = self.information.rows(q, v, a)
         used = self.limits.used(q, v, a, 0.0 * a, self.information.torque(rows))
         return used, self._informed(rows, duration / count)
-
-    def _motion(self, C: Array) -> Motion:
-        """Return the motion with coefficients."""
-        return DesignedMotion(self.basis, C)
 
     def _assessed(
         self,
@@ -307,7 +281,7 @@ class Designer:
         if self.clearance is None:
             return C, None
         for k in range(_TRIALS):
-            contact = self.clearance.nearest(self._motion(C), self.basis.duration)
+            contact = self.clearance.nearest(DesignedMotion(self.basis, C), self.basis.duration)
             if contact is None or contact.margin >= 0.0:
                 return C, contact
             C = _scaled(C, max(1.0 - 0.01 * 2.0**k, 0.5))
@@ -321,8 +295,7 @@ class Designer:
     @property
     def known(self) -> Array:
         """Prior information, in units of the spread, shape (b, b)."""
-        known: Array = np.eye(len(self.spread)) if self.given is None else self.given
-        return known
+        return np.eye(len(self.spread)) if self.given is None else self.given
 
     @cached_property
     def widest(self) -> Array:
@@ -332,19 +305,16 @@ class Designer:
 
     def judged(self, F: Array) -> tuple[float, Array]:
         """Return the criterion of information about the base parameters, and its gradient."""
-        # F (b, b)
         return criterion(self.name, F, self.widest)
 
     def _scale(self, step: float) -> Array:
         """Return the factor of rows with which their squares are information, (n, b, 1)."""
-        scale: Array = np.sqrt(step / self.noise)[:, None, None] * self.spread[:, None]
-        return scale
+        return np.asarray(np.sqrt(step / self.noise)[:, None, None] * self.spread[:, None])
 
     @cached_property
     def _step(self) -> float:
         """Time between two samples of the grid [s]."""
-        step: float = self.basis.duration / (self._functions.shape[1] - 1)
-        return step
+        return self.basis.duration / float(self._functions.shape[1] - 1)
 
     def matrix(self, rows: MotionRows) -> Array:
         """Return the information of a motion plus the prior's, in units of the spread, (b, b)."""
@@ -354,8 +324,7 @@ class Designer:
         n, b, N = rows.W.shape
         scaled = rows.W * self._scale(step)
         flat = scaled.swapaxes(0, 1).reshape(b, n * N)
-        F: Array = flat @ flat.T + self.known
-        return F
+        return np.asarray(flat @ flat.T + self.known)
 
     def _followed(self, C: Array) -> tuple[MotionRows, Array, Array]:
         """Return rows, torques (N, n) and used shares of limits (6, N, n) of a motion."""
@@ -371,8 +340,7 @@ class Designer:
         if self.clearance is None:
             return used, np.inf, rows
         placed = self.clearance.placed(rows.motion[0])
-        margins = self.clearance.margins(placed, spare)
-        return used, float(margins.min(initial=np.inf)), rows
+        return used, float(self.clearance.margins(placed, spare).min(initial=np.inf)), rows
 
     def _near(self, rows: MotionRows, multipliers: Multipliers) -> Nearness | None:
         """Return the distances of near pairs; None if they are not checked."""
@@ -420,8 +388,7 @@ class Designer:
         """Distances that the search requires, shape (pairs, 1) [m]."""
         if self.clearance is None:
             return np.zeros((0, 1))
-        required: Array = self.clearance.required[:, None] + 2.0 * self.clearance.spare
-        return required
+        return self.clearance.required[:, None] + 2.0 * self.clearance.spare
 
     @cached_property
     def postures(self) -> Postures:
@@ -443,10 +410,8 @@ class Designer:
         limits = self.limits
         free = most * limits.sizes[0] - np.abs(C[0] - limits.middle)
         moving = np.abs(self._functions[:, :, 1:] @ C[1:]).max(axis=1)  # (4, n)
-        over = np.vstack(
-            [moving[:1] / np.maximum(free, 1e-9), moving[1:] / limits.sizes[1:4] / most]
-        )
-        C = _scaled(C, 1.0 / np.maximum(1.0, over.max(axis=0)))
+        bounds = np.vstack([np.maximum(free, 1e-9), most * limits.sizes[1:4]])
+        C = _scaled(C, 1.0 / np.maximum(1.0, (moving / bounds).max(axis=0)))
         return self._towards(_scaled(C, 0.0), C, most)
 
     def _towards(self, feasible: Array, C: Array, most: float) -> Array:
@@ -465,9 +430,7 @@ class Designer:
             share = low + (high - low) * np.clip(under / (under - over), 0.02, 0.98)
         return feasible + low * way
 
-    def _search(
-        self, state: State, rounds: int, settled: float, is_over: Callable[[], bool]
-    ) -> Iterator[State]:
+    def _search(self, state: State, settled: float, is_over: Callable[[], bool]) -> Iterator[State]:
         """Yield the state of a search, at first and after each round, until it has converged."""
         from scipy.optimize import minimize
 
@@ -481,7 +444,7 @@ class Designer:
             return value, (gradient * unit).reshape(-1)
 
         yield state
-        for _ in range(rounds):
+        for _ in range(_ROUNDS):
             try:
                 found = minimize(
                     scaled,
@@ -494,7 +457,8 @@ class Designer:
                 return
             state, violation = self._updated(state, found.x.reshape(-1, len(unit)) * unit, settled)
             if violation > _LESS * before:
-                state = replace(state, multipliers=state.multipliers.increased())
+                heavier = _GROWTH * state.multipliers.weight
+                state = replace(state, multipliers=replace(state.multipliers, weight=heavier))
             before = violation
             yield state
             if state.is_settled:
@@ -503,9 +467,7 @@ class Designer:
     def _updated(self, state: State, C: Array, settled: float) -> tuple[State, float]:
         """Return the state of a search after a round, and the violation of the limits."""
         used, margin, rows = self._constraints(C)
-        own = self.judged(self.matrix(rows))[0]
-        multipliers = state.multipliers
-        near = self._near(rows, multipliers)
+        near = self._near(rows, state.multipliers)
         feasible = self._feasible(C, 1.0 - SPARE)
         objective = self._objective(feasible)
         if objective > state.objective - settled:
@@ -514,13 +476,14 @@ class Designer:
                 [(objective, feasible), (self._objective(mixed), mixed)], key=lambda pair: pair[0]
             )
         gain = state.objective - objective
-        is_near = np.abs(used).max() < _OVER and margin >= 0.0 and objective - own < _LOSS
+        outside = self.judged(self.matrix(rows))[0]
+        is_near = np.abs(used).max() < _OVER and margin >= 0.0 and objective - outside < _LOSS
         is_stalled = not is_near and gain < _LOSS  # restart from the feasible motion
         if gain < 0.0:
             feasible, objective = state.feasible, state.objective
         violation = max(float(np.abs(used).max()) - 1.0 + SPARE, -margin / SOFT, 0.0)
         distance = None if near is None else near.distance
-        multipliers = multipliers.raised(used, distance, self._required)
+        multipliers = state.multipliers.raised(used, distance, self._required)
         iterate = feasible if is_stalled else C
         is_settled = bool(is_near and gain < settled)
         return State(feasible, objective, iterate, multipliers, is_settled), violation

@@ -31,8 +31,6 @@ def fixed_tree(model: RobotModel) -> Tree:
 class MotionRegressor:
     """Columns of the torque regressor of a robot's bodies along motions, and their gradient."""
 
-    # columns (b,)
-
     def __init__(self, model: RobotModel, columns: Array) -> None:
         self._tree = fixed_tree(model)
         self._shape = model.n_rows, len(columns)
@@ -45,7 +43,6 @@ class MotionRegressor:
 
     def __call__(self, q: Array, v: Array, a: Array) -> Array:
         """Return the columns at N samples, shape (n, b, N)."""
-        # q (N, n) [rad, m], v (N, n) [rad/s, m/s], a (N, n) [rad/s^2, m/s^2]
         N, lanes = len(q), row_lanes()
         block = lanes.LANES
         out = np.zeros((self._shape[0] * self._shape[1], -(-N // block) * block))
@@ -55,7 +52,6 @@ class MotionRegressor:
 
     def pull(self, q: Array, v: Array, a: Array, weights: Array) -> Array:
         """Return the gradient of sum(weights * columns) by q, v and a, shape (3, N, n)."""
-        # q (N, n) [rad, m], v (N, n) [rad/s, m/s], a (N, n) [rad/s^2, m/s^2], weights (n, b, N)
         by_column = np.array(weights.reshape(-1, len(q)), order="C")
         motion, out = own_motion(q, v, a), np.zeros((3, *q.shape))
         row_lanes().pull_rows(self._tree, self._places, motion, by_column, self._work, out)
@@ -117,13 +113,13 @@ class MotionInformation:
     @cached_property
     def _terms(self) -> list[tuple[DriveTerm, list[int], list[int]]]:
         """Each term of the base drive parameters, which of those it has, and their drives."""
-        found: dict[DriveTerm, tuple[list[int], list[int]]] = {}
+        by_term: dict[DriveTerm, tuple[list[int], list[int]]] = {}
         for k, parameter in enumerate(self._drives[1]):
             drive, term = self.model.layout.drive_parameters[parameter]
-            places, drives = found.setdefault(term, ([], []))
+            places, drives = by_term.setdefault(term, ([], []))
             places.append(k)
             drives.append(drive)
-        return [(term, *places) for term, places in found.items()]
+        return [(term, *places) for term, places in by_term.items()]
 
     @cached_property
     def chains(self) -> Array:
@@ -136,12 +132,10 @@ class MotionInformation:
         for i in range(len(ratios)):
             chain[i, [j - 1 for j in list(self.model.pin_model.supports[i + 1])[1:]]] = True
         linked = ratios.T.astype(int) @ (chain | chain.T) @ ratios > 0
-        share: Array = linked / linked.sum(axis=1, keepdims=True)
-        return share
+        return np.asarray(linked / linked.sum(axis=1, keepdims=True))
 
     def rows(self, q: Array, v: Array, a: Array) -> MotionRows:
         """Return the rows along a motion of N samples."""
-        # q (N, n) [rad or m], v (N, n) [rad/s or m/s], a (N, n) [rad/s^2 or m/s^2]
         W = self._regressor(q, v, a)
         load = (self.beta @ W).T  # drive columns are still 0
         columns, parameters = self._drives
@@ -169,12 +163,10 @@ class MotionInformation:
 
     def torque(self, rows: MotionRows) -> Array:
         """Return the torque along the motion, shape (N, n) [N m or N]."""
-        torque: Array = (self.beta @ rows.W).T
-        return torque
+        return np.asarray((self.beta @ rows.W).T)
 
     def pull(self, rows: MotionRows, weights: Array) -> tuple[Array, Array, Array]:
         """Return the gradient of sum(weights * W) by q, v and a, shape (N, n) each."""
-        # weights (n, b, N)
         columns, parameters = self._drives
         loads = self.model.layout.drive_loads[:, parameters]
         by_value = np.einsum("rk,rkn->kn", loads, weights[:, columns])
@@ -215,7 +207,6 @@ def criterion(name: str, F: Array, widest: Array | None = None) -> tuple[float, 
     References:
         Pukelsheim (2006), Optimal Design of Experiments, chapter 6.
     """
-    # F (b, b)
     if name not in CRITERIA:
         raise SettingsError(f"criterion is {name!r}, wanted one of {', '.join(CRITERIA)}")
     size = len(F)

@@ -13,7 +13,6 @@ from robotid.base.typing import Array
 from robotid.design.clearance import SOFT, Clearance, Contact
 from robotid.design.information import MotionInformation
 from robotid.robot.model import RobotModel
-from robotid.robot.tree import Joint
 
 #: The limited quantities, in the order of ``MotionLimits.sizes``.
 LIMITS = ("position", "velocity", "acceleration", "jerk", "torque", "power")
@@ -32,9 +31,8 @@ class MotionLimits:
     """The limits of each of n joints; inf where there is none."""
 
     middle: Array  # middle of the positions allowed, shape (n,) [rad or m]
-    #: Half the range of positions, and the largest velocity, acceleration, jerk, torque and
-    #: power, shape (6, n), SI units.
-    sizes: Array
+    # half the range of positions, and the largest velocity, acceleration, jerk, torque and power
+    sizes: Array  # (6, n), SI units
 
     @classmethod
     def of_model(
@@ -53,11 +51,11 @@ class MotionLimits:
             raise SettingsError(f"share is {share}, wanted more than 0 and at most 1")
         fastest = np.array([j.velocity if j.velocity > 0 else np.inf for j in model.limits])
         fastest = np.minimum(share * fastest, _each(model, velocity, "velocity"))
-        missing = [
-            text
-            for joint, limit in zip(model.limits, fastest, strict=True)
-            if (text := _missing(joint, float(limit)))
-        ]
+        missing = []
+        for joint, limit in zip(model.limits, fastest, strict=True):
+            is_bounded = joint.has_limits or joint.type == "continuous"
+            lacks = ["position"] * (not is_bounded) + ["velocity"] * bool(limit == np.inf)
+            missing += [f"{joint.name} ({' and '.join(lacks)})"] if lacks else []
         if missing:
             raise SettingsError(
                 f"{Path(model.tree.path).name} states no limit of {listed(missing)}: without it no "
@@ -79,19 +77,8 @@ class MotionLimits:
 
     def used(self, q: Array, v: Array, a: Array, jerk: Array, torque: Array) -> Array:
         """Return a motion's quantities divided by their limits, signed, shape (6, N, n)."""
-        # q (N, n)
         values = np.array([q - self.middle, v, a, jerk, torque, torque * v])
         return values / self.sizes[:, None]
-
-
-def _missing(joint: Joint, velocity: float) -> str:
-    """Return a joint and the limits that neither the URDF nor the user states; empty if none."""
-    known = {
-        "position": joint.has_limits or joint.type == "continuous",
-        "velocity": velocity < np.inf,
-    }
-    lacks = [what for what, is_known in known.items() if not is_known]
-    return f"{joint.name} ({' and '.join(lacks)})" if lacks else ""
 
 
 def _each(model: RobotModel, stated: float | Mapping[str, float], what: str) -> Array:
@@ -118,7 +105,7 @@ class Postures:
     def resting(self, rng: np.random.Generator, tried: int = _TRIED) -> Array:
         """Return the random postures that satisfy limits and distances at rest, shape (k, n)."""
         q = self._drawn(rng, tried)
-        possible: Array = q[self.can_rest(q)]
+        possible = q[self.can_rest(q)]
         if not len(possible):
             possible = self._repaired(q[:_AT_ONCE], rng)
         if not len(possible):
@@ -139,8 +126,7 @@ class Postures:
             now = self._broken_by_joint(other)
             is_better = now.sum(axis=1) <= total
             q[is_better], broken[is_better] = other[is_better], now[is_better]
-        possible: Array = q[self.can_rest(q)]
-        return possible
+        return np.asarray(q[self.can_rest(q)])
 
     def _broken_by_joint(self, q: Array) -> Array:
         """Return each joint's share in the violations of postures, shape (N, n)."""
@@ -150,48 +136,39 @@ class Postures:
             movers = self.clearance.movers
             movers = movers / np.maximum(movers.sum(axis=1, keepdims=True), 1)
             violation += np.maximum(-margins.T, 0.0) / SOFT @ movers
-        by_joint: Array = violation
-        return by_joint
+        return np.asarray(violation)
 
     def one(self, rng: np.random.Generator) -> Array:
         """Return the first of ``resting``, which are tried a few at a time, shape (n,)."""
         for _ in range(_TRIED // _AT_ONCE):
             q = self._drawn(rng, _AT_ONCE)
-            possible: Array = q[self.can_rest(q)]
+            possible = q[self.can_rest(q)]
             if len(possible):
-                break
-        else:
-            possible = self.resting(rng)
-        first: Array = possible[0]
-        return first
+                return np.asarray(possible[0])
+        return np.asarray(self.resting(rng)[0])
 
     def _drawn(self, rng: np.random.Generator, count: int) -> Array:
         """Return random postures, shape (count, n) [rad or m]."""
         share = rng.uniform(-0.8, 0.8, (count, len(self.limits.middle)))
         share[:, self.limits.sizes[0] > 2.0] *= 0.6
-        q: Array = self.limits.middle + share * self.limits.sizes[0]
-        return q
+        return np.asarray(self.limits.middle + share * self.limits.sizes[0])
 
     def can_rest(self, q: Array) -> Array:
-        """Return whether postures satisfy limits and distances at rest, shape (N,), bool."""
-        # q (N, n) [rad or m]
+        """Return whether postures (N, n) satisfy limits and distances at rest, (N,), bool."""
         used, margins = self._at_rest(q)
-        is_clear = (margins >= 0.0).all(axis=0)
-        can: Array = (used.max(axis=(0, 2)) <= 1.0) & is_clear
-        return can
+        return np.asarray((used.max(axis=(0, 2)) <= 1.0) & (margins >= 0.0).all(axis=0))
 
     def _at_rest(self, q: Array) -> tuple[Array, Array]:
-        """Return used shares of limits of postures, (6, N, n), and margins, (pairs, N) [m]."""
+        """Return used shares of limits of postures, (6, N, n), and margins, (pairs, N) [m].
+
+        The margins have the reserve of a design.
+        """
         still = np.zeros_like(q)
         rows = self.information.rows(q, still, still)
         used = np.abs(self.limits.used(q, still, still, still, self.information.torque(rows)))
-        return used, self._margins(q)
-
-    def _margins(self, q: Array) -> Array:
-        """Return margins of distances with the reserve of a design, shape (pairs, N) [m]."""
         if self.clearance is None:
-            return np.zeros((0, len(q)))
-        return self.clearance.margins(self.clearance.placed(q), 1.0)
+            return used, np.zeros((0, len(q)))
+        return used, self.clearance.margins(self.clearance.placed(q), 1.0)
 
     def _why_not(self, used: Array, margins: Array) -> str:
         """Return what rules out all postures: one limit or distance, or several together."""
@@ -244,8 +221,7 @@ class Course:
     """A motion at N samples, and its use of each limit."""
 
     t: Array  # times, shape (N,) [s]
-    #: Position, velocity, acceleration, jerk, torque and power, shape (6, N, n), SI units.
-    values: Array
+    values: Array  # (6, N, n), SI units: position, velocity, acceleration, jerk, torque, power
     limits: MotionLimits  # the robot's limits
     clearance: Clearance | None = None  # the distances to collisions; None: they are not checked
 
@@ -258,7 +234,6 @@ class Course:
         clearance: Clearance | None = None,
     ) -> "Course":
         """Return the course of a sampled motion; its jerk by finite differences."""
-        # t (N,) [s], motion (N, n)
         q, v, a, torque = motion
         jerk = np.gradient(a, t, axis=0)
         return cls(t, np.array([q, v, a, jerk, torque, torque * v]), limits, clearance)
@@ -271,8 +246,7 @@ class Course:
     @property
     def largest(self) -> Array:
         """Largest used share of each limit, by joint, shape (6, n)."""
-        largest: Array = np.abs(self.used).max(axis=1)
-        return largest
+        return np.asarray(np.abs(self.used).max(axis=1))
 
     def peak(self, kind: str, joint: int) -> float:
         """Return the time of a joint's largest use of a limit [s]."""
@@ -286,7 +260,6 @@ class Course:
 
     def nearness(self, chosen: Array) -> tuple[Array, Array]:
         """Return the smallest distance at each sample, and its pair, shape (N,) each."""
-        # chosen (pairs,)
         distance, pairs = np.full(len(self.t), np.inf), np.zeros(len(self.t), dtype=int)
         left = np.arange(len(self.t) if chosen.any() else 0)
         within = _WITHIN
@@ -304,10 +277,8 @@ class Course:
         """Return which pairs of a clearance change their distance in the motion, (pairs,), bool."""
         few = np.unique(np.linspace(0, len(self.t) - 1, _FEW).astype(int))
         placed = clearance.placed(self.values[0][few])
-        change: Array = np.ptp(
-            clearance.near(placed, np.inf, clearance.everything).distance, axis=1
-        )
-        return change > _STILL
+        distance = clearance.near(placed, np.inf, clearance.everything).distance
+        return np.asarray(np.ptp(distance, axis=1) > _STILL)
 
     @cached_property
     def nearest(self) -> Contact | None:
@@ -315,10 +286,10 @@ class Course:
         if self.clearance is None:
             return None
         few, required = self.thinned, self.clearance.required
-        changes, found = few.changes(self.clearance), []
-        for own in np.unique(required[changes]).tolist():
-            distance, pairs = few.nearness(changes & (required == own))
+        changes, contacts = few.changes(self.clearance), []
+        for least in np.unique(required[changes]).tolist():
+            distance, pairs = few.nearness(changes & (required == least))
             k = int(np.argmin(distance))
             names = self.clearance.named[int(pairs[k])]
-            found.append(Contact(*names, float(distance[k]), float(few.t[k]), own))
-        return min(found, key=lambda contact: contact.margin, default=None)
+            contacts.append(Contact(*names, float(distance[k]), float(few.t[k]), least))
+        return min(contacts, key=lambda contact: contact.margin, default=None)

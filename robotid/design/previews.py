@@ -30,7 +30,7 @@ from robotid.data.files.read import Readable
 from robotid.data.log import Log, suggestion
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import low_pass
-from robotid.diagnosis.logs.motion_checks import excitation_finding
+from robotid.diagnosis.logs.check_logs import excitation_finding
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.factors import Factors, compress, join, merge
 from robotid.dynamics.prediction import predict, predict_instants
@@ -74,17 +74,11 @@ _IMPULSE = 40.0  # periods of the filter after which its impulse response is 0
 
 @dataclass(frozen=True, eq=False)
 class TorqueNoise:
-    """Noise of the torque of each joint.
+    """Noise of the torque of each joint."""
 
-    Attributes:
-        std: Standard deviation of each joint, shape (n,) [N m or N].
-        correlation: Time over which it is correlated, shape (n,) [s]; 0 for white noise.
-        origins: Origin for each joint: "stated", "assumed", or "found" in an earlier run.
-    """
-
-    std: Array
-    correlation: Array
-    origins: tuple[str, ...]
+    std: Array  # (n,), standard deviation [N m or N]
+    correlation: Array  # (n,), time over which it is correlated [s]; 0 for white noise
+    origins: tuple[str, ...]  # "stated", "assumed", or "found" in an earlier run
 
     def last(self, count: int) -> "TorqueNoise":
         """Return the noise of the last rows, those of the joints."""
@@ -92,8 +86,7 @@ class TorqueNoise:
 
     def density(self, step: float) -> Array:
         """Return the density of each joint's noise at low frequency, shape (n,) [(N m)^2 s]."""
-        density: Array = self.std**2 * np.maximum(self.correlation, step)
-        return density
+        return np.asarray(self.std**2 * np.maximum(self.correlation, step))
 
 
 def assumed_noise(
@@ -103,12 +96,7 @@ def assumed_noise(
     correlation: float | None = None,
     earlier: TorqueNoise | None = None,
 ) -> TorqueNoise:
-    """Return the noise of each joint: stated, or of an earlier run, or assumed.
-
-    The assumed noise is 1 % of the joint's largest torque.
-
-    size (n,) [N m or N].
-    """
+    """Return the noise of each joint: stated, of an earlier run, or 1 % of its largest torque."""
     for joint, value in stated.items():
         if joint not in model.joints:
             raise SettingsError(
@@ -135,13 +123,11 @@ def largest_gravity(model: RobotModel) -> Array:
     ranges = [(j.lower, j.upper) if j.has_limits else (-np.pi, np.pi) for j in model.limits]
     low, high = np.array(ranges).T
     q = np.random.default_rng(0).uniform(low, high, (_POSES, len(ranges)))
-    torque: Array = np.abs(predict_instants(model, model.standard_parameters(), q)).max(axis=0)
-    return torque
+    return np.asarray(np.abs(predict_instants(model, model.standard_parameters(), q)).max(axis=0))
 
 
 def largest_torques(model: RobotModel, peak: Array) -> Array:
     """Return the largest torque of each joint, (n,): the URDF's limit, or that of a motion."""
-    # peak (n,) [N m or N]
     peak = np.maximum(peak, FAINTEST * max(float(peak.max()), 1e-300))
     limit = np.array([joint.effort for joint in model.limits])
     return np.where(np.isfinite(limit) & (limit > 0), limit, peak)
@@ -149,7 +135,6 @@ def largest_torques(model: RobotModel, peak: Array) -> Array:
 
 def assumed_parameters(model: RobotModel, size: Array, fastest: Array) -> Array:
     """Return the URDF's bodies with friction of a typical size, shape (p,)."""
-    # size (n,) [N m or N], fastest (n,) [rad/s or m/s]
     pi = model.standard_parameters()
     for j, limits in enumerate(model.limits):
         speed = limits.velocity if 0 < limits.velocity < np.inf else max(float(fastest[j]), 1e-3)
@@ -170,8 +155,7 @@ class Run:
     samples: int  # as of ``Reduction``
     share: float  # share of its samples that count as independent [-]
     step: float  # time between two samples [s]
-    #: Weight of the prior selected by its fit, and the plausible one; None if its fit
-    #: selected none.
+    # weight of the prior that its fit selected, and the plausible one; None if it selected none
     weight: tuple[float, float] | None = None
 
     @classmethod
@@ -195,8 +179,6 @@ class Run:
 
         The scatter of a joint's score depends on the direction. The geometric mean over the
         parameters, weighted by the joint's share of their variance, is used.
-
-        K (b, p).
         """
         factors, beta = self.factors, K @ self.standard
         sigma = np.sqrt(factors.residual_squares(beta) / np.maximum(factors.rows, 1))
@@ -220,10 +202,7 @@ class Run:
         )
 
     def meat(self, K: Array, sigma: Array) -> Array:
-        """Return the covariance of its score for samples weighted by sigma^-2, shape (b, b).
-
-        K (b, p), sigma (n,) [N m or N].
-        """
+        """Return the covariance of its score for samples weighted by sigma^-2, shape (b, b)."""
         factors, beta = self.factors, K @ self.standard
         if len(self.segments) < FEWEST_SEGMENTS:
             return factors.information(1.0 / sigma**2) / self.share
@@ -235,18 +214,16 @@ class Run:
 class Preview:
     """Expected result of motions that are not recorded yet.
 
-    Attributes:
-        expected: The expected identification: it predicts their torque exactly, and has the
-            standard errors, sources and bands that follow from the noise.
-        noise: The noise of the torque.
-        before: Standard errors of the base parameters from the earlier run only, shape (b,), inf
-            where it does not determine one; None without an earlier run.
-        between: As of ``Fit.between`` of an earlier result, of each motion, which widens the bands.
+    The expected identification predicts their torque exactly, and has the standard errors, sources
+    and bands that follow from the noise.
     """
 
     expected: TorqueIdentification
-    noise: TorqueNoise
+    noise: TorqueNoise  # noise of the torque
+    # (b,), standard errors of the base parameters from the earlier run only, inf where it does not
+    # determine one; None without an earlier run
     before: Array | None = None
+    # as of ``Fit.between`` of an earlier result, of each motion, which widens the bands
     between: tuple[Array | None, ...] = ()
 
     def __repr__(self) -> str:
@@ -272,8 +249,7 @@ class Preview:
         if self.before is None:
             return None
         before, after = (np.minimum(x, self.plausible) for x in (self.before, self.base_error))
-        gain: Array = before / after
-        return gain
+        return np.asarray(before / after)
 
     @property
     def plausible(self) -> Array:
@@ -373,18 +349,14 @@ def preview_logs(
     size = largest_torques(model, peak)
     earlier = run or like
     pi = assumed_parameters(model, size, fastest) if earlier is None else earlier.standard
-    motions = [_with_expected(motion, pi) for motion in motions]
+    motions = [x.with_torque(predict(model, [pi], x.whole.trajectory)[0]) for x in motions]
     if not isinstance(noise, TorqueNoise):
-        residual_noise = (
-            None if earlier is None else earlier.noise(mapping.K).last(len(model.joints))
-        )
-        noise = assumed_noise(model, size, noise or {}, correlation, residual_noise)
+        known = None if earlier is None else earlier.noise(mapping.K).last(len(model.joints))
+        noise = assumed_noise(model, size, noise or {}, correlation, known)
     information = _Information.of(model, mapping, motions, noise)
     information = information if run is None else information.added_to(run)
-    prior, spread = (
-        model.standard_parameters(),
-        prior_spread(model, information.squares, information.samples),
-    )
+    prior = model.standard_parameters()
+    spread = prior_spread(model, information.squares, information.samples)
     ground = Known(model, mapping, prior, spread, information.share, information.sigma)
     weight = _WEIGHT if earlier is None or earlier.weight is None else earlier.weight
     estimate, wls = _errors(information, ground, choice, weight)
@@ -404,7 +376,7 @@ class _Information:
     sigma: Array  # (n_rows,), noise level of each row behind the filter [N m or N]
     levels: tuple[tuple[Factors, Array], ...]  # of planned motions: density per sample, (n_rows,)
     run: Run | None  # an earlier recording
-    squares: Array  # as of Reduction
+    squares: Array  # as of ``Reduction``
     samples: int
     share: float  # share of their samples that count as independent [-]
 
@@ -491,9 +463,10 @@ def _band(log: SurveyedLog) -> float:
 def _largest(model: RobotModel, motions: Sequence[SurveyedLog]) -> tuple[Array, Array]:
     """Return the largest torque (URDF's bodies) and speed of each joint in motions, (n,)."""
     bodies = model.standard_parameters()
-    moved = [np.abs(predict(model, [bodies], log.whole.trajectory)[0]) for log in motions]
-    speeds = [np.abs(log.whole.trajectory.v) for log in motions]
-    peak, fastest = (np.max([x.max(axis=0) for x in own], axis=0) for own in (moved, speeds))
+    trajectories = [log.whole.trajectory for log in motions]
+    torques = [np.abs(predict(model, [bodies], t)[0]).max(axis=0) for t in trajectories]
+    fastest = np.max([np.abs(t.v).max(axis=0) for t in trajectories], axis=0)
+    peak = np.max(torques, axis=0)
     first = model.n_rows - len(model.joints)
     return peak[first:], fastest[first:]
 
@@ -503,11 +476,6 @@ def _with_torque(log: SurveyedLog) -> SurveyedLog:
     if log.model.constraints and isinstance(log.source, Log):
         return hold_log(log.model, replace(log.source, has_torque=True), log.asked, log.locked)
     return log
-
-
-def _with_expected(log: SurveyedLog, pi: Array) -> SurveyedLog:
-    """Return a motion with the torque that parameters predict, behind its filter."""
-    return log.with_torque(predict(log.model, [pi], log.whole.trajectory)[0])
 
 
 def _errors(

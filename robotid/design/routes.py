@@ -8,7 +8,7 @@ import numpy as np
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.typing import Array
-from robotid.design.clearance import Contact
+from robotid.design.clearance import POSES
 from robotid.design.design import Design, Designer
 from robotid.dynamics.simulation.motions import Motion
 
@@ -18,8 +18,7 @@ _STROKE = 3.0  # [s] largest duration of a sweep ...
 _RANGE = 0.8  # ... and largest share of the joint's free range
 _HOLD = 2.0  # [s] at each static posture
 _BRISK = 0.5  # share of the largest speed between static postures
-_CANDIDATES = 400  # random postures among which static ones are chosen ...
-_SWEPT = 20  # ... and those at which sweeps are tried
+_SWEPT = 20  # random postures at which sweeps are tried
 _PLACES = 41  # positions of a joint's range at which its free range is checked
 _TRIES = 8  # sweeps, each shorter by a fifth than the one before
 _RATE = 100.0  # [Hz] of the samples at which limits are checked
@@ -72,14 +71,10 @@ class Route(Motion):
 def design_sweeps(
     designer: Designer, rng: np.random.Generator, speeds: Sequence[float] = _SPEEDS
 ) -> Design:
-    """Return a motion in which one joint after another moves to and fro at constant speeds.
-
-    Each joint sweeps about one posture, through it in both directions, at each speed; the others
-    rest.
-    """
-    postures = designer.postures.resting(rng, _CANDIDATES)[:_SWEPT]
+    """Return a motion in which each joint sweeps through one posture to and fro at each speed."""
+    postures = designer.postures.resting(rng, POSES)[:_SWEPT]
     ranges = [_free_range(designer, posture) for posture in postures]  # (n, 2) each
-    best = int(np.argmax([(own.sum(axis=1) / designer.limits.sizes[0]).min() for own in ranges]))
+    best = int(np.argmax([(free.sum(axis=1) / designer.limits.sizes[0]).min() for free in ranges]))
     share = _RANGE
     for _ in range(_TRIES):
         route = _sweeps(designer, postures[best], share * ranges[best], speeds)
@@ -136,7 +131,7 @@ def design_stands(designer: Designer, rng: np.random.Generator, count: int = 20)
     References:
         Fedorov (1972), Theory of Optimal Experiments.
     """
-    q = designer.postures.resting(rng, _CANDIDATES)
+    q = designer.postures.resting(rng, POSES)
     still = np.zeros_like(q)
     rows = designer.information.rows(q, still, still)
     scale = np.sqrt(_HOLD / designer.noise)[:, None] * designer.spread
@@ -188,8 +183,7 @@ def _is_feasible(design: Design) -> bool:
 
 
 def _why(design: Design, designer: Designer) -> str:
-    contact: Contact | None = design.contact
-    if contact is not None:
-        return str(contact)
+    if design.contact is not None:
+        return str(design.contact)
     _, joint = np.unravel_index(int(np.argmax(design.used)), design.used.shape)
     return f"{designer.information.model.joints[joint]} needs {100 * design.used.max():.0f} %"

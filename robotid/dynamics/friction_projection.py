@@ -18,10 +18,9 @@ from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.dynamics.prediction import drive_motion_along
-from robotid.robot.as_pinocchio import pinocchio_model
 from robotid.robot.drive_term import DriveMotion, DriveTerm
 from robotid.robot.drives import TERMS, Lag, LuGre, Presliding, Spring
-from robotid.robot.model import RobotModel
+from robotid.robot.model import RobotModel, pinocchio_model
 
 #: The terms that friction is projected on. The offset is always one of them, so that it does not
 #: become friction in a format without offset.

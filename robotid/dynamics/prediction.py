@@ -11,10 +11,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from robotid.base.arguments import real_numbers
 from robotid.base.exceptions import DataError
 from robotid.base.findings import listed
-from robotid.base.typing import Array
+from robotid.base.typing import Array, real_numbers
 from robotid.data.log import Trajectory
 from robotid.dynamics.compiled import work_per_sample
 from robotid.dynamics.constraint_rows import without_forces

@@ -109,7 +109,7 @@ def keep_inertial_rows(model: RobotModel, trajectory: Trajectory) -> None:
 
 def _inertial_support(model: RobotModel) -> tuple[Array, ...]:
     """Return the indices of the inertial parameters of each row, n_rows arrays."""
-    return tuple(np.flatnonzero(row[: model.layout.n_inertial]) for row in model.support())
+    return tuple(np.flatnonzero(row[: model.layout.n_inertial]) for row in model.support)
 
 
 def kept_rows(model: RobotModel, trajectory: Trajectory) -> InertialRows | None:
@@ -199,7 +199,7 @@ def trajectory_rows(
         raise DataError(f"weight has shape {weights.shape}, wanted {shape}")
     every, engine = np.arange(len(model.layout.names)), choose_engine(model, shape[0], compiled)
     inertial = kept_rows(model, trajectory)
-    return TrajectoryRows(model, trajectory, weights, model.support(), every, engine, inertial)
+    return TrajectoryRows(model, trajectory, weights, model.support, every, engine, inertial)
 
 
 class _PinocchioWriter:

@@ -139,7 +139,7 @@ def _held_out_error(model: RobotModel, motion: Trajectory, mask: Array, every: i
     Y = Y.reshape(len(state[0]), len(model.joints), -1)
     part = np.arange(len(Y)) * _PARTS // len(Y) % 2
     error = np.full(len(model.joints), np.nan)
-    for j, support in enumerate(model.support()):
+    for j, support in enumerate(model.support):
         W, tau, used = Y[:, j, support], motion.tau[rows, j], mask[rows, j]
         even, odd = used & (part == 0), used & (part == 1)
         if min(even.sum(), odd.sum()) < _FEW * W.shape[1] or not tau.any():

@@ -13,10 +13,9 @@ from typing import overload
 import numpy as np
 import scipy.linalg
 
-from robotid.base.arguments import real_numbers
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.settings import NOT_NEGATIVE, POSITIVE, Settings, is_number, require_kind, setting
-from robotid.base.typing import Array
+from robotid.base.typing import Array, real_numbers
 from robotid.data.log import Log, Trajectory
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.drive_columns import sure_rows

@@ -24,7 +24,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.diagnosis.residual.discrepancies import explain_residual
 from robotid.diagnosis.residual.drive_choice import choose_drives
-from robotid.diagnosis.residual.misfit import counterbalanced, settled, with_known_springs
+from robotid.diagnosis.residual.misfit import settled
 from robotid.diagnosis.residual.model_error import settled_shapes, with_model_error
 from robotid.diagnosis.residual.term_trials import take_sample
 from robotid.diagnosis.urdf.inertials import (
@@ -145,8 +145,7 @@ def conclude(
     report_stage(progress, "fitting")
     with _explained(doctor_findings):
         recordings = with_repeated_errors(recordings)
-        balanced = counterbalanced(doctor_findings, [log.head.name for log in recordings.fitted])
-        fit = with_drives(recordings, choice, wanted, balanced, progress=progress)
+        fit = with_drives(recordings, choice, wanted, progress=progress)
     report_stage(progress, "errors and intervals")
     sample = take_sample(fit)
     misfits, discrepancies = explain_residual(fit, sample)
@@ -166,7 +165,7 @@ def conclude(
         *unlike_findings(fit.variation),
         *rescaled_findings(fit, _loaded(doctor_findings)),
     ]
-    merged = settled(with_known_springs(_kept(doctor_findings), fit, wanted), of_fit)
+    merged = settled(_kept(doctor_findings), of_fit)
     merged = [finding for finding in merged if not explained_by_assumed(model, finding)]
     merged = rejected(merged, result.predictions, result.scale_check)
     log_errors = blocking(merged, ignore, is_robust=is_robust)
@@ -213,7 +212,6 @@ def with_drives(
     recordings: Recordings,
     choice: EstimatorSettings,
     wanted: Mapping[str, Sequence[str] | None],
-    balanced: Mapping[str, str] | None = None,
     *,
     progress: ProgressCallback | None = None,
 ) -> Fit:
@@ -221,7 +219,7 @@ def with_drives(
     report, rough = progress or ignore_progress, rough_choice(choice)
     report("fits", 0, 1, "fits")
     solved = solve_recordings(recordings, choice)
-    drives = choose_drives(solved.solution, wanted, balanced)
+    drives = choose_drives(solved.solution, wanted)
     if not any(drive.terms for drive in drives):
         return replace(solved.with_errors(), drives=drives)
 

@@ -11,10 +11,15 @@ from robotid.base.settings import Settings
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.residual.misfit import Misfit
 from robotid.diagnosis.residual.torque_split import JointTorque, joint_torques
-from robotid.diagnosis.verdict.evidence import Determined, Predictions
 from robotid.diagnosis.verdict.parameter_table import parameter_entries, parameter_table
 from robotid.diagnosis.verdict.scale_check import PayloadCheck, ScaleCheck, check_scale
-from robotid.diagnosis.verdict.verdict import Verdict, VerdictWarning, judge
+from robotid.diagnosis.verdict.verdict import (
+    Determined,
+    Predictions,
+    Verdict,
+    VerdictWarning,
+    judge,
+)
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.evaluation import Evaluated, Evaluation, Metrics, hidden_joints
 from robotid.estimation.fitting.fitted import Fit, Identified

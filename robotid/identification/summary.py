@@ -5,7 +5,7 @@ from statistics import median
 from typing import Any
 
 from robotid.base.text import columns
-from robotid.diagnosis.verdict.evidence import uses_line
+from robotid.diagnosis.verdict.verdict import uses_line
 
 #: Column heads of the errors of other predictions, by name: of torques, then of positions.
 _BESIDE = {

@@ -31,8 +31,7 @@ class LinkPlace:
     # "moved": the link that the body's joint moves; "fixed": joined to it by fixed joints only;
     # "held": behind a locked joint, with the URDF's inertial
     role: str
-    # its inertial parameters in the body's frame, shape (10,); 0 without inertial
-    parameters: Array
+    parameters: Array  # (10,), in the body's frame; 0 without inertial
 
     @property
     def is_lumped(self) -> bool:
@@ -64,10 +63,7 @@ def link_places(model: RobotModel) -> tuple[LinkPlace, ...]:
 
 
 def link_transfer(model: RobotModel, link: str) -> tuple[int, Array]:
-    """Return the body of a link, and the map of parameters from its frame to the body's.
-
-    -> (10, 10).
-    """
+    """Return the body of a link, and the map (10, 10) of parameters from its frame to that."""
     if link not in model.tree.links:
         raise ModelError(
             f"link {link!r} is not in {Path(model.tree.path).name}; links: "
@@ -114,10 +110,7 @@ def inertial_parameters(inertial: Inertial) -> Array:
 
 
 def negligible_bodies(model: RobotModel) -> tuple[str, ...]:
-    """Return the bodies whose mass in the URDF is negligible, as between the axes of a ball joint.
-
-    Bodies without mass are not among them, nor inconsistent ones.
-    """
+    """Return the consistent bodies of negligible mass, as between the axes of a ball joint."""
     J = pseudo_inertia(model.standard_parameters()[: model.layout.n_inertial])
     mass, least = J[:, 3, 3], np.linalg.eigvalsh(J)[:, 0]
     is_negligible = (least > 0.0) & (mass <= _NEGLIGIBLE * mass.sum())
@@ -125,10 +118,7 @@ def negligible_bodies(model: RobotModel) -> tuple[str, ...]:
 
 
 def central_inertial(parameters: Array) -> Inertial:
-    """Return mass, centre of mass and inertia about it from ten parameters in the link's frame.
-
-    parameters (10,).
-    """
+    """Return mass, centre of mass and inertia about it from ten parameters in the link's frame."""
     m, c = float(parameters[0]), parameters[1:4] / parameters[0]
     xx, xy, yy, xz, yz, zz = parameters[4:]
     about_origin = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
@@ -138,12 +128,9 @@ def central_inertial(parameters: Array) -> Inertial:
 
 
 def principal_moments(parameters: Array) -> tuple[Array, Array]:
-    """Return the second moments of mass about the centre along the principal axes, and the axes.
+    """Return the second moments of mass (3,) about the centre along the principal axes, and these.
 
-    The body is physically consistent if none is negative. The moments of inertia are their sums by
-    pairs.
-
-    parameters (10,) -> (3,) [kg m^2], (3, 3).
+    A body is physically consistent if none is negative; moments of inertia are sums of two.
     """
     H = np.column_stack([np.eye(3), -parameters[1:4] / parameters[0]])  # to the centre
     moments, axes = np.linalg.eigh(H @ pseudo_inertia(parameters)[0] @ H.T)
@@ -156,8 +143,6 @@ def least_density(parameters: Array) -> float:
 
     Of all bodies with the same mass and the same largest density, a homogeneous ellipsoid has the
     smallest determinant of second moments; with semi-axes a these are m a^2 / 5.
-
-    parameters (10,).
     """
     mass = float(parameters[0])
     if mass <= 0:
@@ -175,8 +160,6 @@ def density_share(
     Bodies are drawn from the normal distribution of the estimate; draws that no mass distribution
     has, with a pseudo-inertia that is not positive definite, are left out. With J the
     pseudo-inertia, ``least_density`` is m^3 / (4/3 pi 5^1.5 sqrt(det J)).
-
-    parameters (10,), covariance (10, 10).
     """
     values, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.maximum(values, 0.0))

@@ -12,11 +12,11 @@ from robotid.robot.model import RobotModel
 
 _CLOSED = 1e-6  # largest error of a closed loop, relative to the length of the robot
 _MOST = 30  # iterations of Newton's method
-_SETTLED = 1e-8  # [rad, m] step with which it ends: the error is about its square
-_FAR = 1e3  # [rad, m] step with which it fails
-_RANK = 1e-8  # singular values below this share of the largest are of dependent loops
-_REGULAR = 1e-6  # ... and of dependent columns of a loop
-_DEAD = 1e-4  # ... of positions that loops determine, relative to the length of the robot
+# square root of the rounding error: the step with which Newton's method ends [rad, m], as the error
+# is about its square; and the share of the largest singular value below which loops are dependent
+_PRECISE = 1e-8
+_REGULAR = 1e-6  # ... below which columns of a loop are dependent
+_DEAD = 1e-4  # ... and positions that loops determine, relative to the length of the robot
 _PATH = 25  # steps from the zero position to the first one
 _STEP = 0.25  # [rad, or robot lengths] standard deviation of a step of the random walk
 _APART = 4  # steps of the walk between two states
@@ -45,29 +45,19 @@ class Chains:
         self._is_long = np.isin(model.joints, list(model.layout.prismatic))
 
     def gaps(self, q: Array) -> Array:
-        """Return the error of each loop at each sample, shape (N, loops) [m].
-
-        Angles are multiplied by the length of the robot.
-
-        q (N, n) [rad, m].
-        """
-        loops = range(len(self._ids))
+        """Return the error of each loop at q (N, n), (N, loops) [m]; angles times the length."""
         errors = np.array([self._equations(x)[0] for x in q]).reshape(len(q), -1)
-        found: Array = np.stack(
-            [np.linalg.norm(errors[:, self._loop == k], axis=1) for k in loops], axis=1
-        )
-        return found
+        first = np.flatnonzero(np.diff(self._loop, prepend=-1))
+        return np.sqrt(np.add.reduceat(errors**2, first, axis=1))
 
     def closed(self, q: Array, unknown: Array) -> Array:
-        """Return coordinates at which the loops close, shape (N, n).
+        """Return positions q (N, n) with the unknown ones, (n,) bool, such that the loops close.
 
         The first ones are found on a path from the closed position nearest to 0, which states how
         the chains are assembled; each of the others from the one before it. From the first sample
         at which the loops do not close, the coordinates are constant; see ``gaps``.
-
-        q (N, n) [rad, m], unknown (n,).
         """
-        x, found = self._assembled(), q.copy()
+        x, closed = self._assembled(), q.copy()
         singular = np.linalg.svd(self._equations(x)[1][:, unknown], compute_uv=False)
         if np.sum(singular > _DEAD * self._model.length) < unknown.sum():
             names = listed([self._model.joints[j] for j in np.flatnonzero(unknown)])
@@ -75,23 +65,19 @@ class Chains:
                 f"the loops do not determine the positions of {names} near the zero position; log "
                 "them. If it is a dead centre, shift the zero position of a joint in the URDF"
             )
-        begin = x[~unknown]
-        for part in np.linspace(0.0, 1.0, _PATH + 1)[1:]:
-            x[~unknown] = begin + part * (q[0, ~unknown] - begin)
+        for known in np.linspace(x[~unknown], q[0, ~unknown], _PATH + 1)[1:]:
+            x[~unknown] = known
             x = self._newton(x, unknown)
-        for k, own in enumerate(q):
-            x[~unknown] = own[~unknown]
-            found[k] = x = self._newton(x, unknown)
+        for k, q_k in enumerate(q):
+            x[~unknown] = q_k[~unknown]
+            closed[k] = x = self._newton(x, unknown)
             if not self.is_closed(x):
-                found[k:] = x
+                closed[k:] = x
                 break
-        return found
+        return closed
 
     def is_closed(self, x: Array) -> bool:
-        """Return whether the loops close at coordinates to the accuracy of the computation.
-
-        x (n,) [rad, m].
-        """
+        """Return whether the loops close at coordinates to the accuracy of the computation."""
         return bool(self.gaps(x[None]).max() <= _CLOSED * self._model.length)
 
     def random_states(self, samples: int, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -120,24 +106,19 @@ class Chains:
     def _squares(self, J: Array) -> list[tuple[Array, Array]]:
         """Return rows and columns of square, regular parts of J: of each loop, and of all."""
         groups = [np.flatnonzero(self._loop == k) for k in range(len(self._ids))]
-        found = []
+        squares = []
         for rows in [*groups, np.arange(len(J))]:
             R, columns = qr(J[rows], mode="r", pivoting=True)
             size = np.abs(np.diag(R))
             columns = columns[: np.sum(size > _REGULAR * size[0])]
             chosen = qr(J[np.ix_(rows, columns)].T, mode="r", pivoting=True)[1]
-            found.append((rows[chosen[: len(columns)]], columns))
-        return found
+            squares.append((rows[chosen[: len(columns)]], columns))
+        return squares
 
     def accelerations(self, q: Array, v: Array) -> Array:
-        """Return accelerations that keep closed loops closed, the smallest ones, shape (N, n).
-
-        q (N, n) [rad, m], v (N, n) [rad/s, m/s].
-        """
-        a = np.empty_like(v)
-        for k, (q_k, v_k) in enumerate(zip(q, v, strict=True)):
-            a[k] = _least(self._equations(q_k)[1], self._drift(q_k, v_k))
-        return a
+        """Return the smallest accelerations (N, n) that keep closed loops closed."""
+        states = zip(q, v, strict=True)
+        return np.array([_least(self._equations(q)[1], self._drift(q, v)) for q, v in states])
 
     def _assembled(self) -> Array:
         """Return the closed position that is nearest to 0, shape (n,)."""
@@ -158,7 +139,7 @@ class Chains:
             error, J = self._equations(x)
             step = _least(J[:, unknown], error)
             x[unknown] += step
-            if not _SETTLED * (1.0 + np.linalg.norm(x)) < np.linalg.norm(step) < _FAR:
+            if np.linalg.norm(step) <= _PRECISE * (1.0 + np.linalg.norm(x)):
                 break
         return x
 
@@ -169,10 +150,10 @@ class Chains:
         pin.updateFramePlacements(pin_model, data)
         errors, rows = [], []
         for loop, ids in zip(self._model.loops, self._ids, strict=True):
-            own = [pin.getFrameJacobian(pin_model, data, i, axes) for i in ids]
+            jacobians = [pin.getFrameJacobian(pin_model, data, i, axes) for i in ids]
             places = [data.oMf[i] for i in ids]
             errors.append(loop.error(places))
-            rows.append(loop.rows(own, places[0]))
+            rows.append(loop.rows(jacobians, places[0]))
         J = np.vstack(rows) @ self._model.velocity_map[:, self._first :]
         return self._unit * np.concatenate(errors), self._unit[:, None] * J
 
@@ -182,15 +163,14 @@ class Chains:
         w = self._model.velocity_map[:, self._first :] @ v
         pin.forwardKinematics(pin_model, data, self._configuration(x), w, 0.0 * w)
         pin.updateFramePlacements(pin_model, data)
-        found = []
+        drift = []
         for loop, ids in zip(self._model.loops, self._ids, strict=True):
-            of_frames = [
+            accelerations = [
                 pin.getFrameClassicalAcceleration(pin_model, data, i, axes).vector for i in ids
             ]
             speeds = [pin.getFrameVelocity(pin_model, data, i, axes).angular for i in ids]
-            found.append(loop.drift(of_frames, speeds, data.oMf[ids[0]].rotation))
-        drift: Array = self._unit * np.concatenate(found)
-        return drift
+            drift.append(loop.drift(accelerations, speeds, data.oMf[ids[0]].rotation))
+        return np.asarray(self._unit * np.concatenate(drift))
 
     def _configuration(self, x: Array) -> Array:
         pose = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0] if self._model.free_flyer else []
@@ -200,18 +180,16 @@ class Chains:
 
 def _least(J: Array, error: Array) -> Array:
     """Return the smallest x with J x = -error."""
-    x: Array = -np.linalg.lstsq(J, error, rcond=_RANK)[0]
-    return x
+    return np.asarray(-np.linalg.lstsq(J, error, rcond=_PRECISE)[0])
 
 
 def _sides(J: Array, squares: list[tuple[Array, Array]]) -> list[float]:
     """Return the signs of the determinants of square parts of J; they change at dead centres."""
-    return [float(np.linalg.slogdet(J[np.ix_(*own)])[0]) for own in squares]
+    return [float(np.linalg.slogdet(J[np.ix_(*square)])[0]) for square in squares]
 
 
 def _permitted(J: Array) -> Array:
     """Return the projector on the speeds with J v = 0, shape (n, n)."""
     _, s, Vt = np.linalg.svd(J)
-    rank = int(np.sum(s > _RANK * s.max(initial=1e-300)))
-    Z: Array = Vt[rank:].T @ Vt[rank:]
-    return Z
+    rank = int(np.sum(s > _PRECISE * s.max(initial=1e-300)))
+    return np.asarray(Vt[rank:].T @ Vt[rank:])

@@ -4,24 +4,19 @@ import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from functools import cache
-from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import pinocchio as pin
 
 from robotid.base.exceptions import ModelError, SettingsError
 from robotid.base.findings import listed
-from robotid.base.settings import (
-    Settings,
-    is_number,
-    require_each,
-    require_flag,
-    require_kind,
-    setting,
-)
+from robotid.base.settings import Range, Settings, require_each, require_flag, require_kind, setting
 from robotid.base.typing import Array
 from robotid.robot.drive_term import DriveTerm
+
+_LENGTH = Range("a length [m], at least 0", lambda x: 0.0 <= x < np.inf)
+_FORCE = Range("a force [N]", lambda x: abs(x) < np.inf)
 
 
 @dataclass(frozen=True)
@@ -34,7 +29,9 @@ class Contact(Settings):
         "foot if it has a radius",
     )
     kind: str = setting(
-        "point", "point, which transmits a force, or surface, which also transmits a moment"
+        "point",
+        "point, which transmits a force, or surface, which also transmits a moment",
+        among=("point", "surface"),
     )
     measured: tuple[str, ...] = setting(
         (),
@@ -47,27 +44,34 @@ class Contact(Settings):
         "have contact_<link>, 1 or 0, or it is found",
     )
     radius: float = setting(
-        0.0, "of a ball that rolls on level ground: its ground is this far below the frame [m]"
+        0.0,
+        "of a ball that rolls on level ground: its ground is this far below the frame [m]",
+        within=_LENGTH,
     )
     uncertainty: float | None = setting(
         None,
         "standard deviation of the point of contact along each axis [m], an error of the "
         "intervals; estimated from the logs if not stated",
+        within=_LENGTH,
     )
     axes: str = setting(
         "world",
         "axes of the components: world, or link, as a sensor in it measures",
+        among=("world", "link"),
         dump=lambda axes: None if axes == "world" else axes,
     )
     threshold: float | None = setting(
-        None, "force above which it touches the ground [N], if contact_<link> is a force"
+        None,
+        "force above which it touches the ground [N], if contact_<link> is a force",
+        within=_FORCE,
     )
 
     sizes: ClassVar[dict[str, int]] = {"point": 3, "surface": 6}
     components: ClassVar[tuple[str, ...]] = ("fx", "fy", "fz", "mx", "my", "mz")
 
     def __post_init__(self) -> None:
-        _check_kind(self, f"contact {self.frame!r}")
+        require_kind(self.frame, str, "a frame", "the name of a link")
+        super().__post_init__()
         known = self.components[: self.sizes[self.kind]]
         for component in require_each(self.measured, str, "measured", f"a list of {listed(known)}"):
             if component not in known or self.measured.count(component) > 1:
@@ -76,30 +80,17 @@ class Contact(Settings):
                     f"some of {listed(known)}, each once"
                 )
         require_flag(self.always, "always")
-        require_kind(self.radius, (int, float), "radius of a contact", "a length [m]")
-        if not 0.0 <= self.radius < np.inf or (self.radius > 0.0 and self.kind != "point"):
+        if self.radius > 0.0 and self.kind != "point":
             raise SettingsError(
                 f"radius of the {self.kind} contact {self.frame!r} is {self.radius:g}, wanted a "
                 "positive length [m] of a point contact, or 0"
             )
-        length = 0.0 if self.uncertainty is None else self.uncertainty
-        require_kind(length, (int, float), "uncertainty of a contact", "a length [m]")
-        if not 0.0 <= length < np.inf:
-            raise SettingsError(
-                f"uncertainty of the contact {self.frame!r} is {length:g}, wanted a length [m], at "
-                "least 0"
-            )
-        require_kind(self.axes, str, "axes of a contact", "'world' or 'link'")
-        if self.axes not in ("world", "link"):
-            raise SettingsError(
-                f"axes of the contact {self.frame!r} is {self.axes!r}, wanted 'world' or 'link'"
-            )
-        if not (self.threshold is None or is_number(self.threshold)):
-            raise SettingsError(
-                f"threshold of the contact {self.frame!r} is {self.threshold!r}, wanted a force [N]"
-            )
         if self.is_measured:
             object.__setattr__(self, "always", True)
+
+    @property
+    def _table(self) -> str:  # type: ignore[override]
+        return f"contact {self.frame!r}"
 
     @property
     def rows_measured(self) -> list[int]:
@@ -122,18 +113,12 @@ class Contact(Settings):
         return len(self.measured) == self.sizes[self.kind]
 
     def rows(self, jacobians: Sequence[Array], placement: pin.SE3) -> Array:
-        """Return the velocity that the contact prevents, per speed of the robot, shape (m, nv).
-
-        Args:
-            jacobians: Jacobian of the frame with the axes of the world, shape (6, nv).
-            placement: Placement of the link in the world.
-        """
-        rows = jacobians[0][: self.sizes[self.kind]].copy()
+        """Return the velocity that the contact prevents, per speed of the robot, shape (m, nv)."""
+        rows = jacobians[0][: self.sizes[self.kind]].copy()  # axes of the world, (6, nv)
         axes = placement.rotation if self.axes == "link" else np.eye(3)
         rows[0] -= self.radius * jacobians[0][4]  # v + w x (0, 0, -radius)
         rows[1] += self.radius * jacobians[0][3]
-        turned: Array = (axes.T @ rows.reshape(-1, 3, rows.shape[1])).reshape(rows.shape)
-        return turned
+        return np.reshape(axes.T @ rows.reshape(-1, 3, rows.shape[1]), rows.shape)
 
 
 @dataclass(frozen=True)
@@ -144,7 +129,9 @@ class Loop(Settings):
         MISSING, "the two links, whose frames have their origins at the connection"
     )
     kind: str = setting(
-        "hinge", "point, a ball joint; hinge, a revolute joint; or rigid, whose frames coincide"
+        "hinge",
+        "point, a ball joint; hinge, a revolute joint; or rigid, whose frames coincide",
+        among=("point", "hinge", "rigid"),
     )
     axis: tuple[float, float, float] = setting(
         (0.0, 0.0, 1.0), "axis of the hinge, the same in the frames of both links"
@@ -154,7 +141,7 @@ class Loop(Settings):
 
     def __post_init__(self) -> None:
         require_each(self.frames, str, "frames of a loop", "two names of links")
-        _check_kind(self, f"loop {listed(self.frames)}")
+        super().__post_init__()
         if len(self.frames) != 2 or self.frames[0] == self.frames[1]:
             found = listed(self.frames) or "none"
             raise SettingsError(f"loop has the frames {found}, wanted two links")
@@ -165,18 +152,17 @@ class Loop(Settings):
             )
 
     @property
+    def _table(self) -> str:  # type: ignore[override]
+        return f"loop {listed(self.frames)}"
+
+    @property
     def name(self) -> str:
         """Name for messages."""
         return " - ".join(self.frames)
 
     def rows(self, jacobians: Sequence[Array], placement: pin.SE3) -> Array:
-        """Return the relative velocity that the loop prevents, per speed, shape (m, nv).
-
-        Args:
-            jacobians: Jacobians of the two frames with the axes of the world, each (6, nv).
-            placement: Placement of the first frame in the world.
-        """
-        relative = jacobians[0] - jacobians[1]
+        """Return the relative velocity that the loop prevents, per speed, shape (m, nv)."""
+        relative = jacobians[0] - jacobians[1]  # of the two frames, axes of the world, (6, nv)
         if self.kind != "hinge":
             return relative[: self.sizes[self.kind]]
         return np.vstack([relative[:3], self._across(placement.rotation) @ relative[3:]])
@@ -185,30 +171,24 @@ class Loop(Settings):
         """Return the displacement that the loop prevents, shape (m,) [m, rad]; 0 if it is closed.
 
         Its rate is the prevented velocity, if it is small.
-
-        Args:
-            placements: Placements of the two frames in the world.
         """
         first, second = placements
-        found = np.zeros(self.sizes[self.kind])
-        found[:3] = first.translation - second.translation
+        displacement = np.zeros(self.sizes[self.kind])
+        displacement[:3] = first.translation - second.translation
         if self.kind == "hinge":
             axis = np.asarray(self.axis, dtype=float) / np.linalg.norm(self.axis)
             turned = np.cross(second.rotation @ axis, first.rotation @ axis)
-            found[3:] = self._across(first.rotation) @ turned
+            displacement[3:] = self._across(first.rotation) @ turned
         elif self.kind == "rigid":
-            found[3:] = pin.log3(first.rotation @ second.rotation.T)
-        return found
+            displacement[3:] = pin.log3(first.rotation @ second.rotation.T)
+        return displacement
 
     def drift(self, accelerations: Sequence[Array], speeds: Sequence[Array], R: Array) -> Array:
         """Return the prevented acceleration dJ/dt v without accelerations of joints, shape (m,).
 
-        Args:
-            accelerations: Accelerations of the two frames with the axes of the world, each (6,).
-            speeds: Angular velocities of the two frames with the axes of the world, each (3,).
-            R: Axes of the first frame in the world, shape (3, 3).
+        R are the axes of the first frame; speeds, of both frames, are angular velocities (3,).
         """
-        relative = accelerations[0] - accelerations[1]
+        relative = accelerations[0] - accelerations[1]  # axes of the world, (6,)
         if self.kind != "hinge":
             return relative[: self.sizes[self.kind]]
         across = self._across(R)
@@ -217,8 +197,7 @@ class Loop(Settings):
 
     def _across(self, rotation: Array) -> Array:
         """Return two directions perpendicular to the axis, fixed in the first link, (2, 3)."""
-        across: Array = _perpendicular(tuple(self.axis)) @ rotation.T
-        return across
+        return np.asarray(_perpendicular(tuple(self.axis)) @ rotation.T)
 
 
 @cache
@@ -230,21 +209,11 @@ def _perpendicular(axis: tuple[float, ...]) -> Array:
 Constraint = Contact | Loop
 
 
-def _check_kind(constraint: Any, where: str) -> None:  # noqa: ANN401
-    require_kind(constraint.kind, str, f"kind of {where}", "a word")
-    for frame in constraint.frames:
-        require_kind(frame, str, "a frame", "the name of a link")
-    if constraint.kind not in constraint.sizes:
-        raise SettingsError(
-            f"kind of {where} is {constraint.kind!r}, wanted one of {listed(constraint.sizes)}"
-        )
-
-
 def check_constraints(
     constraints: Sequence[Constraint],
     links: Sequence[str],
     file: str,
-    own_terms: Mapping[str, Sequence[DriveTerm]] = MappingProxyType({}),
+    own_terms: Mapping[str, Sequence[DriveTerm]],
 ) -> None:
     """Refuse constraints of links that are not in the URDF, or stated twice, and wrong terms."""
     require_each(constraints, (Contact, Loop), "constraints", "a list of Contact and Loop")
@@ -260,8 +229,8 @@ def check_constraints(
     stated = [constraint.frames for constraint in constraints]
     if twice := [x for k, x in enumerate(stated) if x in stated[:k]]:
         raise ModelError(f"the contact or loop at {listed(twice[0])} is stated twice; remove one")
-    for name, own in own_terms.items() if constraints else ():
-        if loaded := [term.name for term in own if term.needs_load]:
+    for name, terms in own_terms.items() if constraints else ():
+        if loaded := [term.name for term in terms if term.needs_load]:
             raise SettingsError(
                 f"{name} has the drive term {loaded[0]!r}, which depends on the joint load torque; "
                 "it is not known with unknown forces of contacts or loops. Remove the term"
@@ -276,8 +245,8 @@ def frame_id(pin_model: pin.Model, link: str) -> int:
 def link_positions(pin_model: pin.Model, configurations: Array, links: Sequence[str]) -> Array:
     """Return the positions of links in the world, shape (N, k, 3) [m]: configurations (N, nq)."""
     data, ids = pin_model.createData(), [frame_id(pin_model, link) for link in links]
-    found = np.empty((len(configurations), len(ids), 3))
+    positions = np.empty((len(configurations), len(ids), 3))
     for k, q in enumerate(np.ascontiguousarray(configurations)):
         pin.framesForwardKinematics(pin_model, data, q)
-        found[k] = [data.oMf[i].translation for i in ids]
-    return found
+        positions[k] = [data.oMf[i].translation for i in ids]
+    return positions

@@ -16,6 +16,7 @@ import numpy as np
 from robotid.base.exceptions import SettingsError
 from robotid.base.settings import is_number
 from robotid.base.typing import Array
+from robotid.robot.urdf_text import LARGEST
 
 #: A law's value and its derivative.
 Slope: TypeAlias = tuple[Array | float, Array | float]
@@ -27,7 +28,6 @@ PLAIN, DIRECTED, LOADED, BRISTLES = range(4)
 
 #: A range without ends.
 ANYWHERE = (-np.inf, np.inf)
-_ENDS = (-1e9, 1e9)  # of a term's shape parameters
 
 
 def linear(z: Array) -> Slope:
@@ -51,8 +51,8 @@ class DriveMotion:
 
     def of(self, drive: int | list[int]) -> "DriveMotion":
         """Return the motion of one drive or of several, from arrays with a row for each drive."""
-        q, v, a = self.q[drive], self.v[drive], self.a[drive]
-        direction, load, rate = self.direction[drive], self.load[drive], self.rate[drive]
+        arrays = (self.q, self.v, self.a, self.direction, self.load, self.rate)
+        q, v, a, direction, load, rate = (x[drive] for x in arrays)
         return DriveMotion(q, v, a, direction, load, rate, self.begins)
 
 
@@ -60,52 +60,44 @@ class DriveMotion:
 class DriveTerm(ABC):
     """One term of a drive's torque, linear in its parameter."""
 
-    # range of the data, of the quantity that ``guards`` names: q, or abs(v)
-    data_range: tuple[float, float] = ANYWHERE
+    data_range: tuple[float, float] = ANYWHERE  # of the data, of what ``guards`` names: q or |v|
 
     label: ClassVar[str] = ""  # its name in parameters, as ``"elbow.viscous"``
-    # unit of the parameter for a rotary drive, and for a linear one
-    units: ClassVar[tuple[str, str]] = ("N m", "N")
+    units: ClassVar[tuple[str, str]] = ("N m", "N")  # of the parameter of a rotary, a linear drive
     is_nonnegative: ClassVar[bool] = False  # whether the parameter cannot be negative by physics
     highest: ClassVar[float] = np.inf  # largest parameter of a drive that can move
     is_shared: ClassVar[bool] = True  # whether couplings have it too
-    # whether it multiplies the acceleration and so adds to the mass matrix
-    is_inertia: ClassVar[bool] = False
-    # whether a job's ``friction`` chooses it; if not, it has a switch of its own
-    is_friction: ClassVar[bool] = True
-    # whether its column contains the direction of friction
-    follows_direction: ClassVar[bool] = False
-    # whether its column depends on more than the current q, v, a and direction
-    has_state: ClassVar[bool] = False
+    is_inertia: ClassVar[bool] = False  # whether it multiplies the acceleration
+    is_friction: ClassVar[bool] = True  # whether a job's ``friction`` chooses it; else a switch
+    follows_direction: ClassVar[bool] = False  # whether its column has the direction of friction
+    has_state: ClassVar[bool] = False  # whether it depends on more than q, v, a and direction
     needs_load: ClassVar[bool] = False  # whether its column depends on the torque of its drive
-    # whether it affects the measured torque only, not the motion of the robot
-    is_measured: ClassVar[bool] = False
-    # "v" or "q" if its column is constant outside the range of the data, else ""
-    guards: ClassVar[str] = ""
+    is_measured: ClassVar[bool] = False  # whether it affects only the measured torque, no motion
+    guards: ClassVar[str] = ""  # "v" or "q" if its column is constant outside the data's range
     preference: ClassVar[float] = 1.0  # preference as the name of a base parameter [-]
     typical: ClassVar[tuple[float, float]] = (0.2, 0.9)  # typical range, for simulated robots
-    # attribute of the URDF's ``<dynamics>`` that states it, or None
-    dynamics: ClassVar[str | None] = None
-    # its share of a split torque: "friction", "spring" and the like
-    part: ClassVar[str] = "friction"
+    dynamics: ClassVar[str | None] = None  # attribute of a URDF's ``<dynamics>`` that states it
+    part: ClassVar[str] = "friction"  # its share of a split torque, or "spring" and the like
     # smallest and largest value of its shape parameters, by name; -1e9 and 1e9 of others
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {}
     rising: ClassVar[tuple[str, ...]] = ()  # names of shape parameters that increase in this order
 
     def __post_init__(self) -> None:
         kind = type(self).__name__
-        if not (len(self.data_range) == 2 and self.data_range[0] <= self.data_range[1]):
-            raise SettingsError(
-                f"{kind}: data_range is {self.data_range!r}, wanted (lowest, highest)"
-            )
-        shape = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "data_range"}
-        for key, value in shape.items():
-            low, high = self.ends.get(key, _ENDS)
-            if not isinstance(value, bool) and not (is_number(value) and low <= value <= high):
-                raise SettingsError(f"{kind}: {key} is {value!r}, wanted {low:g} to {high:g}")
-        if any(shape[low] >= shape[high] for low, high in pairwise(self.rising)):
-            found = ", ".join(f"{key} = {shape[key]:g}" for key in self.rising)
-            raise SettingsError(f"{kind}: {found}, wanted increasing values")
+        for f in fields(self):
+            value, (low, high) = getattr(self, f.name), self.ends.get(f.name, (-LARGEST, LARGEST))
+            if f.name == "data_range":
+                is_right, wanted = _is_range(value), "(lowest, highest)"
+            elif isinstance(f.default, bool):
+                is_right, wanted = isinstance(value, bool), "true or false"
+            else:
+                is_right = is_number(value) and low <= value <= high
+                wanted = f"{low:g} to {high:g}"
+            if not is_right:
+                raise SettingsError(f"{kind}: {f.name} is {value!r}, wanted {wanted}")
+        if any(getattr(self, low) >= getattr(self, high) for low, high in pairwise(self.rising)):
+            values = ", ".join(f"{key} = {getattr(self, key):g}" for key in self.rising)
+            raise SettingsError(f"{kind}: {values}, wanted increasing values")
 
     @property
     def name(self) -> str:
@@ -123,6 +115,11 @@ class DriveTerm(ABC):
         return {"term": type(self).__name__, **shape, **guard}
 
 
+def _is_range(value: Any) -> bool:  # noqa: ANN401
+    is_pair = isinstance(value, tuple) and len(value) == 2
+    return is_pair and all(isinstance(x, int | float) for x in value) and value[0] <= value[1]
+
+
 @dataclass(frozen=True)
 class MemorylessTerm(DriveTerm):
     """A term without internal state: a(v) b(q), times direction and load.
@@ -134,8 +131,7 @@ class MemorylessTerm(DriveTerm):
 
     speed_law: ClassVar[Law | None] = None  # the law a of the speed, a static method; None: 1
     position_law: ClassVar[Law | None] = None  # the law b of the position, likewise
-    # whether the absolute joint load torque multiplies it, like the direction
-    is_loaded: ClassVar[bool] = False
+    is_loaded: ClassVar[bool] = False  # whether the absolute joint load torque multiplies it
 
     @property
     def kind(self) -> int:
@@ -206,17 +202,13 @@ class Shape:
     name: str  # field of the terms
     units: tuple[str, str]  # its unit for a rotary drive, and for a linear one
     bounds: tuple[float, float]  # search bounds, relative to its reference
-    # its reference: "v", the largest speed in the data, "q", the range of positions; "": 1
-    of: str = ""
+    of: str = ""  # its reference: "v", the data's largest speed, "q", the range of positions; or 1
 
     def within(self, data_range: DataRange) -> tuple[float, float]:
         """Return the bounds in the shape's own unit."""
-        low, high = self.bounds
-        if not self.of:
-            return low, high
-        first, last = data_range[self.of]
+        first, last = data_range[self.of] if self.of else (0.0, 1.0)
         scale = last if self.of == "v" else last - first
-        return low * scale, high * scale
+        return self.bounds[0] * scale, self.bounds[1] * scale
 
 
 @dataclass(frozen=True)
@@ -225,25 +217,20 @@ class Family:
 
     name: str  # its name in a job's ``friction``
     meaning: str  # its description in a finding
-    # returns the terms from the ranges of the data and the shape parameters
-    make: Callable[..., tuple[DriveTerm, ...]]
+    make: Callable[..., tuple[DriveTerm, ...]]  # terms from ranges of data and shape parameters
     shapes: tuple[Shape, ...] = ()  # its shape parameters
     needs: float = 0.0  # range of positions that the motion must cover, in revolutions; 0: any
     is_automatic: bool = False  # whether ``friction = "auto"`` tries it
-    # code of the finding that a model lacks it; empty: residuals are not tested for it
-    code: str = ""
-    # shape parameters of the test; speeds relative to their root mean square
-    tested: tuple[tuple[float, ...], ...] = ((),)
+    code: str = ""  # of the finding that a model lacks it; empty: residuals are not tested for it
+    tested: tuple[tuple[float, ...], ...] = ((),)  # shapes of the test; speeds relative to the RMS
     instead: tuple[str, ...] = ()  # families advised where the joint moved less than this one needs
     advice: str = ""  # advice in addition to adding it to the model; empty if none
-    # whether its parameter is its size in a finding; else the RMS of its torque
-    has_size: bool = False
-    # whether stiction at reversals, after the filter, resembles it: its finding is a note then
-    is_imitated: bool = False
+    has_size: bool = False  # whether its parameter is its size in a finding; else its RMS torque
+    is_imitated: bool = False  # whether filtered stiction resembles it: its finding is a note then
 
     def tested_terms(self, speed: float) -> tuple[DriveTerm, ...]:
         """Return the terms for which the residual of a fit is tested, without a range."""
-        units = [speed if shape.of == "v" else 1.0 for shape in self.shapes]
-        sizes = [[x * unit for x, unit in zip(own, units, strict=True)] for own in self.tested]
+        units = np.array([speed if shape.of == "v" else 1.0 for shape in self.shapes])
         anywhere = {"q": ANYWHERE, "v": ANYWHERE}
-        return tuple(term for own in sizes for term in self.make(anywhere, *own))
+        sizes = (np.multiply(tested, units).tolist() for tested in self.tested)
+        return tuple(term for shapes in sizes for term in self.make(anywhere, *shapes))

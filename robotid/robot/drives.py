@@ -31,9 +31,10 @@ from robotid.robot.drive_term import (
     Slope,
     linear,
 )
+from robotid.robot.urdf_text import LARGEST
 
 _LEAST = 1e-12  # [rad/s or m/s] speed below which the slope of a power is constant
-_POSITIVE = (1e-9, 1e9)  # bounds of shape parameters that are divisors
+_POSITIVE = (1.0 / LARGEST, LARGEST)  # bounds of shape parameters that are divisors
 #: Value of ``friction`` with which the families of each joint are chosen.
 AUTO = "auto"
 _OF_MODEL = ("none", "viscous", "coulomb")  # allowed in ``friction``, and terms of the model
@@ -458,8 +459,6 @@ TERM_CLASSES: dict[str, type[DriveTerm]] = {
     )
 }  # fmt: skip
 
-#: Family of a counterbalance that opposes gravity.
-COUNTERBALANCE = "harmonics1"
 _SPEED = Shape("speed", ("rad/s", "m/s"), (0.005, 0.5), "v")
 _RISE = Shape("speed", ("rad/s", "m/s"), (0.005, 1.0), "v")
 _WAY = Shape("displacement", ("rad", "m"), (0.0005, 0.015), "q")
@@ -523,12 +522,12 @@ FAMILIES: dict[str, Family] = {
                lambda data_range, way: (Presliding(displacement=way),), (_WAY,), is_automatic=True),
         Family("lag", "a delayed torque (a delay, an elastic gear)",
                lambda data_range: (Lag(),), is_automatic=True),
-        Family(COUNTERBALANCE, "a torque with one period per revolution, as of a counterbalance",
+        Family("harmonics1", "a torque with one period per revolution, as of a counterbalance",
                # unguarded, since gravity contains them too
                lambda data_range: (Harmonic(), Harmonic(is_sine=True)), needs=0.1),
         Family("harmonics2", "a spring or counterbalance torque that depends on the position",
                _harmonics(2), needs=0.5, is_automatic=True, code="spring",
-               instead=(COUNTERBALANCE, "spring")),
+               instead=("harmonics1", "spring")),
         Family("harmonics4",
                "a torque that is periodic in the joint's position (cogging, an eccentric gear)",
                _harmonics(4), needs=0.5, is_automatic=True, code="position_periodic"),
@@ -555,11 +554,6 @@ FAMILIES: dict[str, Family] = {
 }  # fmt: skip
 
 
-def spring_family(turned: float, *families: str) -> str:
-    """Return the first spring family whose required range a joint covered."""
-    return next((name for name in families if has_turned(name, turned)), "spring")
-
-
 def has_turned(family: str, turned: float) -> bool:
     """Return whether a joint covered 1.1 times the range of positions that a family needs."""
     return _SPARE * FAMILIES[family].needs * 2 * np.pi <= turned
@@ -581,11 +575,11 @@ def wanted_families(
     friction: str | Mapping[str, str], joints: Sequence[str]
 ) -> dict[str, tuple[str, ...] | None]:
     """Return the names of each joint's families; None where they are chosen from the data."""
-    wanted_kind = "auto, names of families joined by +, or a table of these by joint"
-    require_kind(friction, (str, Mapping), "friction", wanted_kind)
-    for joint, names in friction.items() if isinstance(friction, Mapping) else ():
-        require_kind(names, str, f"friction of {joint}", wanted_kind)
+    permitted = "auto, names of families joined by +, or a table of these by joint"
+    require_kind(friction, (str, Mapping), "friction", permitted)
     stated = {"*": friction} if isinstance(friction, str) else {"*": AUTO, **friction}
+    for joint, names in stated.items():
+        require_kind(names, str, f"friction of {joint}", permitted)
     unknown_joints = [joint for joint in stated if joint not in (*joints, "*")]
     if unknown_joints:
         raise SettingsError(
@@ -595,14 +589,14 @@ def wanted_families(
     wanted: dict[str, tuple[str, ...] | None] = {}
     for joint in joints:
         names = stated.get(joint, stated["*"])
-        own = [name for name in names.split("+") if name and name not in _OF_MODEL]
-        unknown = [name for name in own if name not in FAMILIES]
+        families = [name for name in names.split("+") if name and name not in _OF_MODEL]
+        unknown = [name for name in families if name not in FAMILIES]
         if names != AUTO and unknown:
             raise SettingsError(
                 f"friction of {joint} has {listed(unknown)}, wanted auto, or some of "
                 f"{listed(FAMILIES)}"
             )
-        wanted[joint] = None if names == AUTO else tuple(own)
+        wanted[joint] = None if names == AUTO else tuple(families)
     return wanted
 
 
@@ -616,24 +610,13 @@ def term_from_dict(table: Mapping[str, Any]) -> DriveTerm:
     kind = TERM_CLASSES.get(str(table.get("term")))
     if kind is None:
         raise SettingsError(f"term is {table.get('term')!r}, wanted one of {listed(TERM_CLASSES)}")
-    known = {field.name: field.default for field in fields(kind)}
-    values: dict[str, Any] = {}
-    for key, value in table.items():
-        if key == "term":
-            continue
+    known: dict[str, Any] = {field.name: field.default for field in fields(kind)}
+    values = {key: value for key, value in table.items() if key != "term"}
+    for key, value in values.items():
         if key not in known:
             raise SettingsError(f"{kind.__name__} has no {key!r}; it has {listed(known)}")
-        values[key] = _read_field(kind, key, value, known[key])
+        if isinstance(value, list):
+            values[key] = tuple(value)
+        elif is_number(value) and not isinstance(known[key], bool):
+            values[key] = type(known[key])(value)
     return kind(**values)
-
-
-def _read_field(kind: type[DriveTerm], key: str, value: object, default: object) -> object:
-    if key == "data_range":
-        if isinstance(value, Sequence) and len(value) == 2 and all(map(is_number, value)):
-            return (float(value[0]), float(value[1]))
-        raise SettingsError(f"{kind.__name__}: data_range is {value!r}, wanted [lowest, highest]")
-    is_flag = isinstance(default, bool)
-    if is_flag is not isinstance(value, bool) or not (is_flag or is_number(value)):
-        wanted = "true or false" if is_flag else "a finite number"
-        raise SettingsError(f"{kind.__name__}: {key} is {value!r}, wanted {wanted}")
-    return type(default)(value)  # type: ignore[call-arg]

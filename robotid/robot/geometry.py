@@ -6,6 +6,8 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +28,9 @@ _MOST_BYTES = 2**28  # of a mesh; that of a link has about 2**20
 _SIDES = 16  # of the prism around a cylinder
 _MOST_FACES = 100  # a hull with more is replaced by an outer polytope with this many faces
 _GROWN = 0.05  # enlargement on each side of the box of a body's geometry, over its diagonal
-_GROWN_BLIND = 0.35  # the same of the box of its frames only, which have no width ...
-_NARROWEST = 0.1  # ... and at least this share of the longest link
-_HOUSINGS = 0.1  # of the robot's length, for the parts of a body beyond its joints
+_GROWN_BLIND = 0.35  # the same of the box of its frames only, which have no width
+#: Share of the robot's length that a body extends at least beyond its frames, on each side.
+BEYOND_FRAMES = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +40,7 @@ class Surface:
     vertices: Array  # corners, shape (V, 3) [m]
     faces: Array  # triangles as indices of corners, shape (F, 3)
     rgba: tuple[float, ...] | None  # colour, shape (4,), 0 to 1; None if the file states none
-    # whether it is known to be closed, together with the other colours of its file
-    is_closed: bool = False
+    is_closed: bool = False  # whether it is known to be, with the other colours of its file
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,9 +85,8 @@ def find_mesh(name: str, urdf: str | Path) -> Path | None:
         return path if os.path.isfile(path) else None
     is_package = re.match(r"(package|model)://", name) is not None
     inside = re.sub(r"^(package|model)://", "", name).lstrip("/")
-    whole = Path(name)
-    if not is_package and whole.is_absolute():
-        return whole if os.path.isfile(whole) else None
+    if not is_package and Path(name).is_absolute():
+        return Path(name) if os.path.isfile(name) else None
     if is_package and ".." in Path(inside).parts:
         return None
     _, _, without = inside.partition("/")
@@ -103,18 +103,17 @@ def read_surfaces(path: Path) -> tuple[Surface, ...]:
     """Read a mesh: STL, DAE, OBJ, PLY, OFF or glTF."""
     if path.suffix.lower() not in _FORMATS:
         raise ValueError(f"{path.name} is not a mesh, wanted {', '.join(_FORMATS)}")
-    # the readers of the formats raise errors of every kind
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise ValueError(f"the file has more than {_MOST_BYTES // 2**20} MiB")
         return _read_surfaces(path)
-    except Exception as error:
+    except Exception as error:  # the readers of the formats raise errors of every kind
         raise ValueError(f"{path.name} cannot be read: {error}") from error
 
 
 def _read_surfaces(path: Path) -> tuple[Surface, ...]:
     import trimesh
 
+    if path.stat().st_size > _MOST_BYTES:
+        raise ValueError(f"the file has more than {_MOST_BYTES // 2**20} MiB")
     scene = trimesh.load_scene(path)
     metres = 1.0
     if path.suffix.lower() == ".dae":  # the one format that states its unit
@@ -214,45 +213,33 @@ def geometry_half_spaces(model: RobotModel, shape: str) -> dict[str, tuple[Array
 
 
 def body_points(model: RobotModel, *, with_visual: bool = False) -> dict[str, Array]:
-    """Return points whose convex hull contains each body, in the frame of its moved link.
+    """Return points whose convex hull contains each body, (k, 3) [m], in its moved link's frame.
 
-    They are those of a link's collision geometry, or of its visual one if it has none. Curved
-    shapes are replaced by polyhedra around them. A body is omitted if one of its links with mass
-    has no geometry, or a mesh that is not found: its mass has no bounds.
-
-    -> (k, 3) [m].
+    A body is omitted if one of its links with mass has no geometry, or a mesh that is not found:
+    its mass has no bounds. The visual geometry is added to the other on demand.
     """
-    clouds = _clouds(model.tree.robot, model.tree.path)
+    clouds, unread = link_clouds(model)
+    seen = {link for link, *_ in clouds}
     if with_visual:
-        visual = _visual_clouds(model.tree.robot, model.tree.path)
-        clouds = {x: [*own, *visual[x]] if x in visual else own for x, own in clouds.items()}
-    found: dict[str, list[Array]] = {body: [] for body in model.layout.bodies}
-    open_bodies = set()
+        clouds += [cloud for cloud in link_clouds(model, ("visual",))[0] if cloud[0] in seen]
+    points = {k: [x for _, body, x in clouds if body == k] for _, k, _ in clouds}
     for place in link_places(model):
-        if place.body < 0:
-            continue
-        body = model.layout.bodies[place.body]
-        parts = clouds.get(place.link, [])
-        known = [points for points in parts if points is not None]
-        if len(known) < len(parts) or (not known and place.parameters.any()):
-            open_bodies.add(body)
-        elif known:
-            index = model.pin_model.getFrameId(place.link, pin.FrameType.BODY)
-            placement = model.pin_model.frames[index].placement.homogeneous
-            found[body].append(_moved(np.vstack(known), placement))
-    return {
-        body: np.vstack(parts) for body, parts in found.items() if parts and body not in open_bodies
-    }
+        if place.link in unread or (place.link not in seen and place.parameters.any()):
+            points.pop(place.body, None)
+    bodies = enumerate(model.layout.bodies)
+    return {body: np.vstack(points[k]) for k, body in bodies if k in points}
 
 
-def link_clouds(model: RobotModel) -> tuple[list[tuple[str, int, Array]], list[str]]:
-    """Return points whose convex hulls contain each shape of each link, in the frame of its body.
+def link_clouds(
+    model: RobotModel, tags: tuple[str, ...] = ("visual", "collision")
+) -> tuple[list[tuple[str, int, Array]], list[str]]:
+    """Return points (k, 3) [m] whose hulls contain the shapes of links, in the body's frame.
 
-    They are those of a link's collision geometry, or of its visual one if it has none.
-
-    -> (k, 3) [m].
+    They are those of a link's collision geometry, or of its visual one if it has none; curved
+    shapes are replaced by polyhedra around them. Each has its link and its body. Links of which a
+    shape cannot be read are listed beside them.
     """
-    shapes = _clouds(model.tree.robot, model.tree.path)
+    shapes = _clouds(model.tree.robot, model.tree.path, tags)
     clouds, unread = [], []
     for link in model.tree.links:
         frame = model.pin_model.frames[model.pin_model.getFrameId(link, pin.FrameType.BODY)]
@@ -266,14 +253,12 @@ def link_clouds(model: RobotModel) -> tuple[list[tuple[str, int, Array]], list[s
 
 
 def body_boxes(model: RobotModel) -> dict[str, Array]:
-    """Return a box that contains all mass of each body, in the frame of its moved link.
+    """Return a box (2, 3) [m] that contains all mass of each body, in its moved link's frame.
 
     It contains the body's geometry, enlarged by 5 % of its diagonal on each side. For a body
     without geometry it contains its frames (of its joints, links and tools), enlarged by 35 % and
     at least 10 % of the robot's longest link. It also contains the URDF's body: the uniform box of
     equal mass, centre and second moments.
-
-    -> (2, 3) [m].
     """
     bodies, frames = model.layout.bodies, body_frames(model)
     shapes, boxes = body_points(model), {}
@@ -282,7 +267,7 @@ def body_boxes(model: RobotModel) -> dict[str, Array]:
         points = np.array(shapes.get(body, frames[body]))
         low, high = points.min(axis=0), points.max(axis=0)
         diagonal = float(np.linalg.norm(high - low))
-        blind = max(_GROWN_BLIND * diagonal, _NARROWEST * model.length)
+        blind = max(_GROWN_BLIND * diagonal, BEYOND_FRAMES * model.length)
         grown = _GROWN * diagonal if body in shapes else blind
         low, high = low - grown, high + grown
         if J_i[3, 3] > 0:
@@ -316,7 +301,7 @@ def kinematic_lengths(model: RobotModel) -> dict[str, float]:
     for i, body in enumerate(bodies, start=1):
         points = np.array(frames[body])
         span = float(np.linalg.norm(points[:, None] - points, axis=2).max())
-        length = max(span, steps[i]) + float(travel[i]) + _HOUSINGS * float(reach.max())
+        length = max(span, steps[i]) + float(travel[i]) + BEYOND_FRAMES * float(reach.max())
         if 0 < length < np.inf:
             lengths[body] = length
     return lengths
@@ -347,10 +332,7 @@ def hull_half_spaces(points: Array) -> tuple[Array, Array]:
 
 
 def body_frames(model: RobotModel) -> dict[str, list[Array]]:
-    """Return the origins of the frames of each body (its joints, links, tools), by its name.
-
-    -> (3,) [m].
-    """
+    """Return the origins (3,) [m] of the frames of each body: its joints, links and tools."""
     pins, bodies = model.pin_model, model.layout.bodies
     frames: dict[str, list[Array]] = {body: [np.zeros(3)] for body in bodies}
     for frame in pins.frames:
@@ -363,60 +345,41 @@ def body_frames(model: RobotModel) -> dict[str, list[Array]]:
 
 
 @lru_cache(maxsize=2)  # the meshes of a robot are read once
-def _clouds(robot: ET.Element, urdf: str) -> dict[str, list[Array | None]]:
-    """Return the points of each shape of each link, in its frame; None if it cannot be read.
-
-    They are those of the collision shapes of a link, or of its visual ones if it has none.
-    """
-    shapes = _by_link(read_shapes(robot, "visual")) | _by_link(read_shapes(robot, "collision"))
-    return {link: [_cloud(shape, Path(urdf)) for shape in own] for link, own in shapes.items()}
-
-
-@lru_cache(maxsize=2)
-def _visual_clouds(robot: ET.Element, urdf: str) -> dict[str, list[Array]]:
-    """Return the points of each visual shape of each link that can be read, in its frame."""
-    shapes, path = _by_link(read_shapes(robot, "visual")), Path(urdf)
-    clouds = {link: [_cloud(shape, path) for shape in own] for link, own in shapes.items()}
-    return {link: [x for x in own if x is not None] for link, own in clouds.items()}
-
-
-def _by_link(shapes: Sequence[Shape]) -> dict[str, list[Shape]]:
+def _clouds(robot: ET.Element, urdf: str, tags: tuple[str, ...]) -> dict[str, list[Array | None]]:
+    """Return the points of each link's shapes of its last tag; None if a shape cannot be read."""
     by_link: dict[str, list[Shape]] = {}
-    for shape in shapes:
-        by_link.setdefault(shape.link, []).append(shape)
-    return by_link
-
-
-def _cloud(shape: Shape, urdf: Path) -> Array | None:
-    points = _shape_points(shape, urdf)
-    return None if points is None else _moved(points, shape.placement)
+    for tag in tags:
+        groups = groupby(read_shapes(robot, tag), key=attrgetter("link"))
+        by_link |= {link: list(shapes) for link, shapes in groups}
+    return {
+        link: [_shape_points(shape, Path(urdf)) for shape in shapes]
+        for link, shapes in by_link.items()
+    }
 
 
 def _shape_points(shape: Shape, urdf: Path) -> Array | None:
-    corners: Array = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T
+    """Return the corners of a polyhedron around a shape, in the frame of its link."""
+    points: Array = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T
     size: Array = np.array(shape.size)
-    match shape.kind:
-        case "box":
-            corners *= 0.5 * size
-            return corners
-        case "sphere":
-            corners *= size[0]
-            return corners
-        case "cylinder":
-            angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
-            radius, length = size
-            ring = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
-            ring *= radius / np.cos(np.pi / _SIDES)
-            half = 0.5 * length * np.array([0.0, 0.0, 1.0])
-            return np.vstack([ring - half, ring + half])
-    path = find_mesh(shape.file, urdf) if shape.kind == "mesh" else None
-    if path is None:
-        return None
-    try:
-        surfaces = read_surfaces(path)
-    except ValueError:  # reported by the finding "geometry_unread"
-        return None
-    return np.vstack([s.vertices for s in surfaces]) * size if surfaces else None
+    if shape.kind == "box":
+        points *= 0.5 * size
+    elif shape.kind == "sphere":
+        points *= size
+    elif shape.kind == "cylinder":
+        radius, length = size
+        angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
+        ring = np.column_stack([np.cos(angle), np.sin(angle)]) * radius / np.cos(np.pi / _SIDES)
+        points = np.vstack([np.insert(ring, 2, z, axis=1) for z in (-0.5 * length, 0.5 * length)])
+    else:
+        path = find_mesh(shape.file, urdf) if shape.kind == "mesh" else None
+        try:
+            surfaces = () if path is None else read_surfaces(path)
+        except ValueError:  # reported by the finding "geometry_unread"
+            return None
+        if not surfaces:
+            return None
+        points = np.vstack([s.vertices for s in surfaces]) * size
+    return _moved(points, shape.placement)
 
 
 def _moved(points: Array, H: Array) -> Array:

@@ -11,8 +11,7 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import ParameterLayout
 
 POSES = 10_000
-_CLOSED_POSES = 200
-_BLOCK = 200  # poses whose mass matrices are in memory together
+_BLOCK = 200  # poses whose mass matrices are in memory together; all of a robot with loops
 
 
 @dataclass(frozen=True)
@@ -32,13 +31,10 @@ class MassMatrixCheck:
 def check_mass_matrix(
     model: RobotModel, pi: Array, *, poses: int = POSES, seed: int = 0
 ) -> MassMatrixCheck:
-    """Return whether the mass matrix, armatures included, is positive definite at random poses.
-
-    pi (p,).
-    """
+    """Return whether the mass matrix, armatures included, is positive definite at random poses."""
     rng = np.random.default_rng(seed)
     if model.loops and not model.free_flyer:
-        q, Z = Chains(model).random_states(min(poses, _CLOSED_POSES), rng)
+        q, Z = Chains(model).random_states(min(poses, _BLOCK), rng)
         M = joint_mass_matrices(model, pi, q)
         size = np.trace(M, axis1=1, axis2=2)[:, None, None]
         M = Z @ M @ Z + np.abs(size) * (np.eye(M.shape[-1]) - Z)
@@ -71,10 +67,7 @@ def _are_above(M: Array, least: float) -> bool:
 
 
 def joint_mass_matrices(model: RobotModel, pi: Array, q: Array) -> Array:
-    """Return the mass matrices of the joints, armatures included, shape (N, n_rows, n_rows).
-
-    pi (p,), q (N, n) [rad, m].
-    """
+    """Return the mass matrices at q (N, n), armatures included, shape (N, n_rows, n_rows)."""
     return _mass_matrices(model.with_parameters(pi), pi, q)
 
 
@@ -89,10 +82,7 @@ def _mass_matrices(bodies: RobotModel, pi: Array, q: Array) -> Array:
 def rigid_mass_matrices(
     model: RobotModel, configurations: Array, data: pin.Data | None = None
 ) -> Array:
-    """Return the mass matrices of the bodies alone, without drives, shape (N, n_rows, n_rows).
-
-    configurations (N, nq).
-    """
+    """Return the mass matrices without drives at configurations (N, nq), (N, n_rows, n_rows)."""
     data = model.pin_model.createData() if data is None else data
     M = np.empty((len(configurations), model.pin_model.nv, model.pin_model.nv))
     for M_k, configuration in zip(M, configurations, strict=True):
@@ -100,18 +90,13 @@ def rigid_mass_matrices(
     G = model.velocity_map
     if np.array_equal(G, np.eye(len(G))):
         return M
-    mass: Array = G.T @ M @ G
-    return mass
+    return np.asarray(G.T @ M @ G)
 
 
 def drive_inertia(layout: ParameterLayout, pi: Array) -> Array:
-    """Return the drives' contribution to the mass matrix of the joints, (n, n) [kg m^2, or kg].
-
-    pi (p,).
-    """
+    """Return the drives' share of the mass matrix of the joints, (n, n) [kg m^2, or kg]."""
     Ia = pi[layout.n_inertial :] * [term.is_inertia for _, term in layout.drive_parameters]
-    added: Array = (layout.drive_loads * Ia) @ layout.drive_loads.T
-    return added
+    return np.asarray((layout.drive_loads * Ia) @ layout.drive_loads.T)
 
 
 def carried_inertia(model: RobotModel) -> Array:

@@ -1,22 +1,25 @@
 """The robot: a kinematic tree with Pinocchio's dynamics and named standard parameters."""
 
 import math
-from collections.abc import Mapping, Sequence
+import os
+import sys
+import tempfile
+import threading
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from robotid.base.arguments import real_numbers
 from robotid.base.exceptions import DataError, ModelError, SettingsError
 from robotid.base.findings import listed
-from robotid.base.native_messages import caught_messages
-from robotid.base.settings import require_each, require_flag, require_kind
-from robotid.base.typing import Array
+from robotid.base.settings import LARGEST_SETTING, require_each, require_flag, require_kind
+from robotid.base.typing import Array, real_numbers
 from robotid.robot.constraints import Constraint, Contact, Loop, check_constraints
 from robotid.robot.drive_term import DriveMotion, DriveTerm
 from robotid.robot.drives import DRIVE_TERMS, TERMS
@@ -27,8 +30,10 @@ from robotid.robot.urdf_text import LARGEST
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
 _OFFSET = 0.01  # [m] axes that are nearer have no distance: 78 URDFs have 0.05 m or more, or 0.5 mm
 _STRONGEST = 100.0  # [m/s^2] with more, accelerations are negligible beside gravity
-_MOST = 1e30  # largest absolute value of a parameter, SI units: products of a few are finite
 _UNIT = 1e-6  # tolerance of the norm of a quaternion
+_ONE_AT_A_TIME = threading.Lock()
+_KINDS = ("Error:", "Warning:")  # first word of console_bridge's messages, which urdfdom uses
+_PLACE = "         at line "  # the second line of such a message: a line of urdfdom's source
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +93,7 @@ class RobotModel:
         gravity: Sequence[float] = GRAVITY,
         terms: Sequence[str] = DRIVE_TERMS,
         couplings: Sequence[Coupling] = (),
-        own_terms: Mapping[str, Sequence[DriveTerm]] = MappingProxyType({}),
+        own_terms: Mapping[str, Sequence[DriveTerm]] | None = None,
         dynamics: str = "full",
         snap_angles: bool = False,
         constraints: Sequence[Constraint] = (),
@@ -98,22 +103,20 @@ class RobotModel:
 
         Args:
             path: The URDF file, or its tree.
-            joints: Names of the joints that move, in the wanted order; all movable ones, in
-                Pinocchio's order, if None.
+            joints: The joints that move, in the wanted order; if None all, in Pinocchio's order.
             locked: Positions of locked joints [rad or m], "*" that of all others; a joint that is
                 neither in ``joints`` nor here is locked at 0, or follows the joint that it mimics.
             free_flyer: Whether the base floats; its six rows are the first ones.
             mimic: "independent" treats a mimic joint as a joint with its own torque; "coupled"
                 moves it with the joint that it mimics, whose torque drives both.
             gravity: Gravity in the frame of the root link, shape (3,) [m/s^2].
-            terms: Drive terms that are parameters, a subset of armature, viscous, coulomb, offset.
+            terms: Drive terms that are parameters, of armature, viscous, coulomb and offset.
             couplings: Drives that move several joints.
             own_terms: Further terms of single drives, by name of the joint or coupling.
             dynamics: "full"; or "static" for gravity, with drive terms that act at zero speed.
-            snap_angles: Whether rounded angles of joint origins, 3.1416, are replaced by the exact
-                multiple of pi/12; see ``exact_angle``.
-            constraints: Contacts with the ground, and loops that close kinematic chains; their
-                forces are unknown.
+            snap_angles: Whether rounded angles of joint origins, as 3.1416, become exact multiples
+                of pi/12; see ``exact_angle``.
+            constraints: Contacts with the ground and closed loops; their forces are unknown.
             passive: Joints without a drive: their torque is 0, and they have no drive terms except
                 those in ``own_terms``.
 
@@ -124,34 +127,33 @@ class RobotModel:
             ModelError: If the URDF or a number is not usable, or a joint is not in the URDF.
             SettingsError: If a term or a coupling is unknown.
         """
+        locked = {} if locked is None else locked
+        own_terms = {} if own_terms is None else own_terms
         require_kind(path, (str, Path, Tree), "path", "the path of a URDF")
-        for name, value, kinds, wanted in (
-            ("joints", joints, (list, tuple, str, type(None)), "a list of names"),
-            ("locked", locked, (Mapping, type(None)), "a table of positions by joint"),
-            ("own_terms", own_terms, Mapping, "a table of terms by joint"),
-            ("mimic", mimic, str, "'independent' or 'coupled'"),
-            ("dynamics", dynamics, str, f"one of {listed(DYNAMICS)}"),
-        ):
-            require_kind(value, kinds, name, wanted)
-        for name in (*(joints or ()), *(locked or ())):
+        require_kind(joints, (list, tuple, str, type(None)), "joints", "a list of names")
+        require_kind(locked, Mapping, "locked", "a table of positions by joint")
+        require_kind(own_terms, Mapping, "own_terms", "a table of terms by joint")
+        for name in (*(joints or ()), *locked):
             require_kind(name, str, "one of joints or locked", "the name of a joint")
         require_each(terms, str, "terms", f"a list of some of {listed(DRIVE_TERMS)}")
         require_each(passive, str, "passive", "a list of names of joints")
         require_each(couplings, Coupling, "couplings", "a list of Coupling")
-        for name, own in own_terms.items():
-            require_each(own, DriveTerm, f"own_terms of {name!r}", "a list of drive terms")
-        for name, flag in (("free_flyer", free_flyer), ("snap_angles", snap_angles)):
-            require_flag(flag, name)
+        for name, further in own_terms.items():
+            require_each(further, DriveTerm, f"own_terms of {name!r}", "a list of drive terms")
+        require_flag(free_flyer, "free_flyer")
+        require_flag(snap_angles, "snap_angles")
         tree = path if isinstance(path, Tree) else read_tree(path)
         tree = tree.snapped() if snap_angles else tree
         check_constraints(constraints, tree.links, Path(tree.path).name, own_terms)
-        if mimic not in ("independent", "coupled"):
-            raise ModelError(f"mimic is {mimic!r}, wanted 'independent' or 'coupled'")
-        if dynamics not in DYNAMICS:
-            raise ModelError(f"dynamics is {dynamics!r}, wanted one of {listed(DYNAMICS)}")
+        for name, word, known in (
+            ("mimic", mimic, ("independent", "coupled")),
+            ("dynamics", dynamics, DYNAMICS),
+        ):
+            require_kind(word, str, name, f"one of {listed(known)}")
+            if word not in known:
+                raise ModelError(f"{name} is {word!r}, wanted one of {listed(known)}")
         if dynamics == "static":
-            _check_gravity(gravity)
-            terms, own_terms = _terms_at_rest(terms, own_terms)
+            terms, own_terms = _terms_at_rest(terms, own_terms, gravity)
         if not (tree.movable or free_flyer):
             raise ModelError(
                 f"{Path(tree.path).name}: robot {tree.name!r} has no movable joint, so there is "
@@ -161,7 +163,7 @@ class RobotModel:
         full = _build(tree, free_flyer, gravity)
         first = 2 if free_flyer else 1  # Pinocchio's joint 0 is the world, 1 may be the base
         free = [name for name in list(full.names)[first:] if name not in followers]
-        moving, positions = choose_joints(tree, free, joints, locked or {}, followers)
+        moving, positions = choose_joints(tree, free, joints, locked, followers)
         if not moving and not free_flyer:
             raise ModelError("all joints are locked, so there is nothing to identify; unlock one")
         reduced = _reduce(full, positions)
@@ -179,17 +181,10 @@ class RobotModel:
             own={name: tuple(terms) for name, terms in own_terms.items() if terms},
             passive=frozenset(passive),
         )
-        fixed = MappingProxyType(positions)
         return cls(
-            tree, reduced, layout, G, shift, free_flyer, fixed, mimic,
+            tree, reduced, layout, G, shift, free_flyer, positions, mimic,
             dynamics=dynamics, constraints=tuple(constraints),
         )  # fmt: skip
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "locked": dict(self.locked)}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state, locked=MappingProxyType(state["locked"]))
 
     @property
     def options(self) -> dict[str, Any]:
@@ -277,10 +272,7 @@ class RobotModel:
         return self.standard_parameters() if self.reference is None else self.reference
 
     def standard_parameters(self) -> Array:
-        """Return the standard parameters of the URDF, shape (p,), SI units.
-
-        The drive terms are 0, since the URDF's values of them are not used.
-        """
+        """Return the URDF's standard parameters, (p,), SI units, with drive terms of 0."""
         return self._standard_parameters.copy()
 
     @cached_property
@@ -293,9 +285,6 @@ class RobotModel:
 
         Args:
             own: The terms, by name of the joint or coupling.
-
-        Raises:
-            SettingsError: If a name is not that of a drive.
         """
         require_kind(own, Mapping, "own", "a table of drive terms")
         by_drive = {
@@ -331,35 +320,25 @@ class RobotModel:
 
         Args:
             pi: Standard parameters, shape (p,) or only the inertial ones, shape (10 bodies,).
-
-        Returns:
-            A new model; the drive terms of pi are not part of it.
-
-        Raises:
-            DataError: If pi has another length, or a value that is not finite or not below 1e30.
         """
         pi, size = real_numbers(pi, "pi"), self.layout.n_inertial
         if pi.shape not in ((size,), (len(self.layout.names),)):
             raise DataError(f"pi has shape {pi.shape}, wanted ({len(self.layout.names)},)")
-        for i in np.flatnonzero(~(np.abs(pi[:size]) <= _MOST)).tolist():
+        for i in np.flatnonzero(~(np.abs(pi[:size]) <= LARGEST_SETTING)).tolist():
             name, unit = self.layout.names[i], self.layout.units[i]
-            raise DataError(f"{name} is {pi[i]:g} {unit}, wanted a finite number below {_MOST:g}")
+            raise DataError(
+                f"{name} is {pi[i]:g} {unit}, wanted a finite number below {LARGEST_SETTING:g}"
+            )
         copy = pin.Model(self.pin_model)
         for i, values in enumerate(pi[:size].reshape(-1, 10)):
             copy.inertias[i + 1] = _inertia(values)
         return replace(self, pin_model=copy)
 
     def configurations(self, q: Array) -> Array:
-        """Return Pinocchio's configurations from joint coordinates.
+        """Return Pinocchio's configurations (N, nq): a continuous joint is cosine and sine.
 
         Args:
             q: Joint coordinates, shape (N, n), or (N, 7 + n) with a floating base [rad, m].
-
-        Returns:
-            Configurations, shape (N, nq): a continuous joint as cosine and sine.
-
-        Raises:
-            DataError: If q has another width, is not finite, or a quaternion is not of length 1.
         """
         base, q = 7 if self.free_flyer else 0, real_numbers(q, "q")
         wanted = base + len(self.joints)
@@ -397,23 +376,14 @@ class RobotModel:
 
         Args:
             what: What needs a fixed base, as "motion design".
-
-        Raises:
-            DataError: If it is such a robot.
         """
         if self.free_flyer or self.constraints:
-            found = "the base floats" if self.free_flyer else "the robot has contacts or loops"
-            raise DataError(f"{self.name}: {found}; {what} needs a robot with a fixed base")
-
-    def support(self) -> Array:
-        """Return which parameters can affect which row, shape (n_rows, p), bool.
-
-        False where the regressor is 0 for every motion.
-        """
-        return self._support
+            fault = "the base floats" if self.free_flyer else "the robot has contacts or loops"
+            raise DataError(f"{self.name}: {fault}; {what} needs a robot with a fixed base")
 
     @cached_property
-    def _support(self) -> Array:
+    def support(self) -> Array:
+        """Which parameters affect which row for some motion, shape (n_rows, p), bool."""
         pin_model = self.pin_model
         moves = np.zeros((pin_model.nv, pin_model.njoints), dtype=bool)  # which speeds, which body
         for body in range(1, pin_model.njoints):
@@ -428,13 +398,62 @@ class RobotModel:
         return support
 
 
+def pinocchio_model(model: RobotModel, pi: Array) -> pin.Model:
+    """Return Pinocchio's model with inertias, armature, damping and dry friction of parameters.
+
+    Bodies behind locked joints are part of the links before them. With q, v and a of the model,
+
+    ``tau = rnea(q, v, a) + damping v - where(v > 0, lowerDryFrictionLimit, upperDryFrictionLimit)``
+
+    is the predicted torque of moving joints: ``rnea`` includes the armature, and the dry friction
+    of a joint that moves forwards is at its lower limit. Coulomb friction Fc and offset give the
+    limits -Fc - offset and Fc - offset; at rest, dry friction is anywhere between them. With mimic
+    joints or another order of joints, ``RobotModel.configurations`` and ``velocity_map`` convert
+    the identified joints to Pinocchio's, and torques back.
+
+    Terms without such a field are omitted, and a warning names them: friction and inertia of
+    couplings, and friction that depends on load, position or an internal state or, other than
+    linearly, on speed.
+
+    pi (p,).
+    """
+    layout, made = model.layout, pin.Model(model.with_parameters(pi).pin_model)
+    fields = {term: np.zeros(made.nv) for term in ("armature", "viscous", "coulomb", "offset")}
+    missing = []
+    parameters = zip(
+        layout.drive_parameters, layout.drive_names, pi[layout.n_inertial :], strict=True
+    )
+    for (d, term), name, value in parameters:
+        ratios = [(joint, ratio) for joint, ratio in layout.drives[d].ratios if ratio != 0.0]
+        if term.name not in fields or len(ratios) != 1:
+            missing += [name] if value != 0.0 and ratios else []
+            continue
+        ((joint, ratio),) = ratios
+        # tau_j = r f(r v_j): a negative ratio changes the sign of the offset only
+        share = {"coulomb": abs(ratio), "offset": ratio}.get(term.name, ratio**2)
+        fields[term.name][made.joints[made.getJointId(joint)].idx_v] += share * value
+    made.armature, made.damping = fields["armature"], fields["viscous"]
+    made.lowerDryFrictionLimit = -fields["coulomb"] - fields["offset"]
+    made.upperDryFrictionLimit = fields["coulomb"] - fields["offset"]
+    if missing:
+        warnings.warn(
+            f"Pinocchio's model has no field for {listed(missing)}: its torques are without these "
+            "terms; predict(q, v, a) includes them",
+            stacklevel=4,
+        )
+    return made
+
+
 def _terms_at_rest(
-    terms: Sequence[str], own_terms: Mapping[str, Sequence[DriveTerm]]
+    terms: Sequence[str], own_terms: Mapping[str, Sequence[DriveTerm]], gravity: Sequence[float]
 ) -> tuple[list[str], dict[str, list[DriveTerm]]]:
     """Return the drive terms that act at rest."""
+    if not np.any(_gravity(gravity)):
+        raise SettingsError(
+            "dynamics is 'static', but gravity is 0, wanted gravity that loads the joints"
+        )
     common = [x for x in terms if x not in TERMS or _acts_at_rest(TERMS[x])]
-    own = {name: [term for term in own if _acts_at_rest(term)] for name, own in own_terms.items()}
-    return common, own
+    return common, {name: list(filter(_acts_at_rest, own)) for name, own in own_terms.items()}
 
 
 def _acts_at_rest(term: DriveTerm) -> bool:
@@ -442,13 +461,6 @@ def _acts_at_rest(term: DriveTerm) -> bool:
     still, one = np.zeros(2), np.array([0.5, 1.0])
     slow = DriveMotion(q=one, v=still, a=still, direction=one, load=one, rate=still)
     return bool(term.column(slow).any())
-
-
-def _check_gravity(gravity: Sequence[float]) -> None:
-    if not np.any(_gravity(gravity)):
-        raise SettingsError(
-            "dynamics is 'static', but gravity is 0, wanted gravity that loads the joints"
-        )
 
 
 def _inertia(values: Array) -> pin.Inertia:
@@ -498,13 +510,11 @@ def _gravity(gravity: Sequence[float]) -> Array:
 
 def _reduce(model: pin.Model, positions: Mapping[str, float]) -> pin.Model:
     reference = pin.neutral(model)
-    ids = []
-    for name, position in positions.items():
-        joint_id = model.getJointId(name)
-        joint = model.joints[joint_id]
+    ids = [model.getJointId(name) for name in positions]
+    for i, position in zip(ids, positions.values(), strict=True):
+        joint = model.joints[i]
         value = [position] if joint.nq == 1 else [np.cos(position), np.sin(position)]
         reference[joint.idx_q : joint.idx_q + joint.nq] = value
-        ids.append(joint_id)
     return pin.buildReducedModel(model, sorted(ids), reference) if ids else model
 
 
@@ -523,3 +533,33 @@ def _velocity_map(
         G[joint.idx_v, base + moving.index(leader)] = ratio
         shift[joint.idx_v] = offset
     return G, shift
+
+
+@contextmanager
+def caught_messages() -> Iterator[list[str]]:
+    """Catch the messages that urdfdom and Pinocchio print on file descriptor 2."""
+    messages: list[str] = []
+    with _ONE_AT_A_TIME, tempfile.TemporaryFile() as caught:
+        try:
+            stderr = os.dup(2)
+        except OSError:  # no stderr: nothing can be printed there
+            yield messages
+            return
+        if sys.stderr is not None:
+            sys.stderr.flush()
+        os.dup2(caught.fileno(), 2)
+        try:
+            yield messages
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+        caught.seek(0)
+        others = []
+        for line in caught.read().decode(errors="replace").splitlines():
+            kind, _, text = line.partition(" ")
+            if kind in _KINDS:
+                messages.append(text.strip())
+            elif not line.startswith(_PLACE):
+                others.append(f"{line}\n")
+        if others:
+            os.write(2, "".join(others).encode())

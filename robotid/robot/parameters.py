@@ -17,7 +17,7 @@ from robotid.base.settings import (
     require_kind,
     setting,
 )
-from robotid.base.typing import Array
+from robotid.base.typing import Array, frozen
 from robotid.robot.drive_term import DriveTerm
 from robotid.robot.drives import DRIVE_TERMS, TERMS
 from robotid.robot.urdf_text import LARGEST
@@ -75,29 +75,23 @@ class ParameterLayout:
     coupling (without an offset, unless it replaces the drive of a joint).
     """
 
-    # names of the bodies, one per movable joint (and one for a floating base)
-    bodies: tuple[str, ...]
-    joints: tuple[str, ...]  # names of the joints that move
-    # the drive terms that are identified, names in ``TERMS`` in its order
-    terms: tuple[str, ...] = DRIVE_TERMS
+    bodies: tuple[str, ...]  # one per movable joint, and one for a floating base
+    joints: tuple[str, ...]  # those that move
+    terms: tuple[str, ...] = DRIVE_TERMS  # the drive terms of all drives, in the order of ``TERMS``
     couplings: tuple[Coupling, ...] = ()  # drives that move several joints
     prismatic: frozenset[str] = frozenset()  # names of the prismatic joints
-    # ranges of the prismatic joints with limits, by name [m]
-    strokes: Mapping[str, float] = field(default_factory=dict)
+    strokes: Mapping[str, float] = field(default_factory=dict)  # their ranges, if limited [m]
     # further terms of single drives, by the drive's name; they follow the others
     own: Mapping[str, tuple[DriveTerm, ...]] = field(default_factory=dict)
-    # names of the joints without a drive, which have no terms but those in ``own``
-    passive: frozenset[str] = frozenset()
+    passive: frozenset[str] = frozenset()  # joints without a drive: they have ``own`` terms only
 
     def __post_init__(self) -> None:
-        unknown = [term for term in self.terms if term not in TERMS]
-        if unknown:
+        if unknown := [term for term in self.terms if term not in TERMS]:
             raise SettingsError(f"unknown drive terms {listed(unknown)}; known: {listed(TERMS)}")
         for coupling in self.couplings:
             named = [joint for joint, _ in coupling.ratios]
             named += [coupling.name] if coupling.replaces else []
-            missing = [joint for joint in named if joint not in self.joints]
-            if missing:
+            if missing := [joint for joint in named if joint not in self.joints]:
                 raise SettingsError(
                     f"coupling {coupling.name!r} has the joints {listed(missing)}, wanted joints "
                     f"that are identified: {listed(self.joints)}"
@@ -126,13 +120,11 @@ class ParameterLayout:
                 f"passive has {listed(strange)}, wanted joints that are identified and have no "
                 f"drive: some of {listed(self.joints)}"
             )
-        unknown = [name for name in self.own if name not in {d.name for d in self.drives}]
-        if unknown:
+        drives = [drive.name for drive in self.drives]
+        if unknown := [name for name in self.own if name not in drives]:
             raise SettingsError(
-                f"terms are stated for {listed(unknown)}, wanted drives: "
-                f"{listed(drive.name for drive in self.drives)}"
+                f"terms are stated for {listed(unknown)}, wanted drives: {listed(drives)}"
             )
-
         names = self.drive_names
         if len(set(names)) < len(names):
             twice = sorted({name for name in names if names.count(name) > 1})
@@ -165,8 +157,7 @@ class ParameterLayout:
         for row, drive in zip(ratios, self.drives, strict=True):
             for joint, ratio in drive.ratios:
                 row[self.joints.index(joint)] = ratio
-        ratios.setflags(write=False)
-        return ratios
+        return frozen(ratios)
 
     @cached_property
     def drive_speeds(self) -> Array:
@@ -181,8 +172,7 @@ class ParameterLayout:
             for joint in self.joints
         ]
         weight = np.abs(self.drive_ratios) + 1e-300  # also of a coupling without a ratio yet
-        speeds: Array = weight @ np.array(joints) / weight.sum(axis=1)
-        return speeds
+        return np.asarray(weight @ np.array(joints) / weight.sum(axis=1))
 
     @cached_property
     def drive_parameters(self) -> tuple[tuple[int, DriveTerm], ...]:
@@ -215,8 +205,7 @@ class ParameterLayout:
     @cached_property
     def drive_loads(self) -> Array:
         """Ratio of each joint's row to the column of a drive parameter, shape (n, k) [-]."""
-        loads: Array = self.drive_ratios[[d for d, _ in self.drive_parameters]].T
-        return loads
+        return np.asarray(self.drive_ratios[[d for d, _ in self.drive_parameters]].T)
 
     @cached_property
     def inertial_names(self) -> tuple[str, ...]:
@@ -245,10 +234,7 @@ class ParameterLayout:
         return np.isin([name.rsplit(".", 1)[0] for name in self.names], list(owners))
 
     def scales(self, length: float) -> Array:
-        """Return the scale 1 kg length^k of each parameter, with which columns are comparable.
-
-        -> (p,).
-        """
+        """Return the scales (p,), 1 kg length^k, with which columns are comparable."""
         inertial = [1.0, *[length] * 3, *[length**2] * 6] * len(self.bodies)
         rotary = [t.is_inertia and not self._is_linear(d) for d, t in self.drive_parameters]
         return np.append(inertial, np.where(rotary, length**2, 1.0))
@@ -272,12 +258,10 @@ class ParameterLayout:
 
 
 def to_paper_order(pi: Array) -> Array:
-    """Return inertial parameters in the order of the paper's vector (9), (10).
+    """Return inertial parameters (10 n,) in the order of the paper's vector (9), (10).
 
     References:
         Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (9)-(10).
-
-    pi (10 n,) -> (10 n,) [Ixx Ixy Ixz Iyy Iyz Izz mx my mz m].
     """
     order = [INERTIAL_TERMS.index(term) for term in PAPER_TERMS]
     return _by_body(pi)[:, order].reshape(-1)
@@ -304,27 +288,19 @@ def pseudo_inertia_basis() -> Array:
 
 
 def pseudo_inertia(pi: Array) -> Array:
-    """Return the pseudo-inertia J = [[Sigma, m c], [(m c)^T, m]] of each body.
+    """Return the pseudo-inertia J = [[Sigma, m c], [(m c)^T, m]] of each of n bodies, (n, 4, 4).
 
     A body is physically consistent if and only if J is positive semidefinite.
 
     References:
         Wensing, Kim, Slotine (2018), Linear Matrix Inequalities for Physically Consistent
         Inertial Parameter Identification, (8).
-
-    pi (10 n,) -> (n, 4, 4) [kg m^2, kg m, kg].
     """
-    J: Array = np.einsum("nk,kij->nij", _by_body(pi), pseudo_inertia_basis())
-    return J
+    return np.asarray(np.einsum("nk,kij->nij", _by_body(pi), pseudo_inertia_basis()))
 
 
 def inertial_from_pseudo_inertia(J: Array) -> Array:
-    """Return the ten inertial parameters of each body, shape (..., 10).
-
-    It is the inverse of ``pseudo_inertia``.
-
-    J (..., 4, 4).
-    """
+    """Return the ten inertial parameters of bodies, (..., 10), from ``pseudo_inertia``'s J."""
     trace = np.trace(J[..., :3, :3], axis1=-2, axis2=-1)[..., None, None]
     inertia = trace * np.eye(3) - J[..., :3, :3]
     i, j = (0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2)  # xx xy yy xz yz zz

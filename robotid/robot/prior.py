@@ -14,13 +14,12 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.robot.bodies import held_parameters, link_places, negligible_bodies
 from robotid.robot.drive_term import DriveMotion
-from robotid.robot.geometry import body_frames, body_points
+from robotid.robot.geometry import BEYOND_FRAMES, body_frames, body_points
 from robotid.robot.mass_matrix import carried_inertia
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 
 _SMALLEST_MASS = 0.1  # of the mean mass: deviation of a link's mass even if its URDF states 0
-_SMALLEST_RADIUS = 0.1  # of the robot's length: the same for a link's size
 _POSITIONS = 16  # of a revolution at which terms that depend on the position are evaluated
 _FAINTEST = 1e-6  # smallest RMS of a column
 #: Why the inertial of a body is assumed, by the code of the finding.
@@ -31,7 +30,6 @@ REASONS = MappingProxyType({
     "inertial_units": "masses or lengths in another unit than kg and m",
 })  # fmt: skip
 _DENSITY = 1000.0  # [kg/m^3] without a body to take it from
-_HALF_WIDTH = 0.1  # of the robot's length: of a body without geometry, around its frames
 _LEAST_SIDE = 0.01  # [m] thin sheets have a volume
 _SLACK = 1e-9  # relative violation of positive definiteness that is rounding
 _COPIES = 3  # identical isotropic inertials are placeholders
@@ -41,24 +39,19 @@ _FARTHEST = 30.0  # RMS distance of the mass from the joint over that box; in mm
 
 
 def prior_spread(model: RobotModel, squares: Array, samples: int) -> Array:
-    """Return the prior standard deviation of each standard parameter, shape (p,).
+    """Return the prior standard deviation of each standard parameter, (p,): squares (3, n_rows).
 
     That of a body is its own size: its mass m, m r and m r^2, with r the distance of the centre of
     mass plus the radius of gyration. That of a drive term is the value with which it alone would
     have the RMS of the measured torque: rms(tau) over the RMS of its column; for an armature at
     least the inertia of the bodies about its joint.
-
-    squares (3, n_rows).
     """
     rms = np.sqrt(squares / max(samples, 1))
     return np.concatenate([_inertial_spread(model), _drive_spread(model, rms)])
 
 
 def payload_spread(model: RobotModel) -> Array:
-    """Return the prior standard deviations of a payload's parameters, shape (10,).
-
-    They are those of the robot's mass at the distance of its longest link.
-    """
+    """Return the prior deviations (10,) of a payload: the robot's mass at its longest link."""
     masses = model.standard_parameters()[: model.layout.n_inertial : 10]
     mass, radius = max(float(np.abs(masses).sum()), 1e-3), model.length
     return mass * np.array([1.0, *[radius] * 3, *[radius**2] * 6])
@@ -71,20 +64,17 @@ def _inertial_spread(model: RobotModel) -> Array:
     mass = np.maximum(np.abs(J[:, 3, 3]), _SMALLEST_MASS * mean)
     gyration = np.sqrt(np.abs(np.trace(J[:, :3, :3], axis1=1, axis2=2)) / mass)
     radius = np.linalg.norm(J[:, :3, 3], axis=1) / mass + gyration
-    radius = np.maximum(radius, _SMALLEST_RADIUS * model.length)
-    one = np.ones(len(mass))
-    spread: Array = mass[:, None] * np.column_stack([one, *[radius] * 3, *[radius**2] * 6])
-    return spread.reshape(-1)
+    radius = np.maximum(radius, BEYOND_FRAMES * model.length)
+    by_term = np.column_stack([radius**0, *[radius] * 3, *[radius**2] * 6])
+    return np.ravel(mass[:, None] * by_term)
 
 
 def _drive_spread(model: RobotModel, rms: Array) -> Array:
     first = model.n_rows - len(model.joints)
     tau, v, a = (_positive(row[first:]) for row in rms)
     carried = carried_inertia(model)
-    q = np.linspace(-np.pi, np.pi, _POSITIONS, endpoint=False)[:, None] + 0.0 * v
-    typical = DriveMotion(
-        q, v + 0.0 * q, a + 0.0 * q, np.ones_like(q), tau + 0.0 * q, tau * a / v + 0.0 * q
-    )
+    q = np.linspace(-np.pi, np.pi, _POSITIONS, endpoint=False)[:, None]
+    typical = DriveMotion(*np.broadcast_arrays(q, v, a, np.ones(()), tau, tau * a / v))
     spread = []
     for d, term in model.layout.drive_parameters:
         size = np.sqrt(np.mean(term.column(typical) ** 2, axis=0))
@@ -115,7 +105,7 @@ def with_assumed_inertials(model: RobotModel) -> RobotModel:
     J = pseudo_inertia(pi - held)
     frames = body_frames(model)
     points = {body: np.array(frames[body]) for body in bodies}
-    half_width = _HALF_WIDTH * model.length
+    half_width = BEYOND_FRAMES * model.length
     boxes = {body: _grown(points[body], half_width) for body in bodies}
     # the frames of a few bodies do not indicate their size
     size_of = {body: boxes[body][1] for body in bodies}
@@ -162,10 +152,7 @@ def assumed_masses(model: RobotModel) -> tuple[str, ...]:
 
 
 def _reasons(model: RobotModel, J: Array, sides: dict[str, Array]) -> dict[str, str]:
-    """Return the code of each body that is not stated in a usable way.
-
-    The pseudo-inertias have shape (n, 4, 4), the sides of a body's box (3,) [m].
-    """
+    """Return the code of each body that is not usable: J (n, 4, 4), sides of its box (3,) [m]."""
     bodies = model.layout.bodies
     mass, least = J[:, 3, 3], np.linalg.eigvalsh(J)[:, 0]
     scale = np.trace(J, axis1=1, axis2=2)

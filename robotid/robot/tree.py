@@ -12,8 +12,6 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
@@ -24,7 +22,6 @@ from robotid.robot.urdf_text import LARGEST, parse_urdf, read_numbers, write_exa
 #: The types of joint that have a degree of freedom.
 MOVABLE = ("revolute", "continuous", "prismatic")
 _ENDLESS = 200.0  # [rad or m] range that counts as no limit: no cable allows 30 revolutions
-_ZERO = (0.0, 0.0, 0.0)
 #: Attributes of an ``<inertia>``, in the order of ``Inertial.inertia``.
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _LIGHTEST = 1e-15  # [kg] smallest mass of a link that has one: quotients stay finite
@@ -37,7 +34,7 @@ _MOST_JOINTS = 300  # memory grows with their square, time with their cube: 2 Gi
 class Inertial:
     """The ``<inertial>`` of a link."""
 
-    mass: float  # mass [kg]
+    mass: float  # [kg]
     com: tuple[float, ...]  # centre of mass in the link frame [m]
     rpy: tuple[float, ...]  # roll, pitch, yaw of the frame of the inertia [rad]
     inertia: tuple[float, ...]  # ixx ixy ixz iyy iyz izz about the centre of mass [kg m^2]
@@ -57,8 +54,8 @@ class Joint:
     effort: float = math.inf  # effort limit [N m or N], inf if none is stated
     # name of the joint that it mimics, multiplier [-], offset [rad or m]; or None
     mimic: tuple[str, float, float] | None = None
-    xyz: tuple[float, ...] = _ZERO  # origin in the parent's frame [m]
-    rpy: tuple[float, ...] = _ZERO  # roll, pitch, yaw there [rad]
+    xyz: tuple[float, ...] = (0.0, 0.0, 0.0)  # origin in the parent's frame [m]
+    rpy: tuple[float, ...] = (0.0, 0.0, 0.0)  # roll, pitch, yaw there [rad]
     axis: tuple[float, ...] = (1.0, 0.0, 0.0)  # direction of the joint axis, of any length
 
     @property
@@ -92,12 +89,6 @@ class Tree:
     inertials: Mapping[str, Inertial]  # the ``<inertial>`` of each link that has one, by its name
     # the parsed ``<robot>``, for elements that the dynamics do not need
     robot: ET.Element = field(repr=False, compare=False)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "inertials": dict(self.inertials)}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state, inertials=MappingProxyType(state["inertials"]))
 
     @property
     def movable(self) -> tuple[Joint, ...]:
@@ -165,7 +156,7 @@ def _tree(robot: ET.Element, path: str) -> Tree:
         for link, element in links.items()
         if (inertial := element.find("inertial")) is not None
     }
-    return Tree(path, name, root, tuple(links), joints, MappingProxyType(inertials), robot)
+    return Tree(path, name, root, tuple(links), joints, inertials, robot)
 
 
 def _unique(elements: list[ET.Element], kind: str, where: str) -> dict[str, ET.Element]:
@@ -219,7 +210,8 @@ def _pose(element: ET.Element, at: str) -> tuple[tuple[float, ...], tuple[float,
     origin = element.find("origin")
     if origin is not None and origin.get("quat_xyzw") is not None:
         raise ModelError(f"{at} origin has quat_xyzw, wanted rpy; convert it to rpy angles")
-    return read_numbers(origin, "xyz", at, _ZERO), read_numbers(origin, "rpy", at, _ZERO)
+    none = (0.0, 0.0, 0.0)
+    return read_numbers(origin, "xyz", at, none), read_numbers(origin, "rpy", at, none)
 
 
 def _mimic(element: ET.Element | None, at: str) -> tuple[str, float, float] | None:

@@ -10,7 +10,7 @@ from robotid.cli import excite, main
 from robotid.data.files.formats import open_table
 from robotid.data.signal_settings import LogSource
 from robotid.design.clearance import Box
-from robotid.design.excitation_settings import MotionSettings
+from robotid.design.excitation import MotionSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

@@ -135,7 +135,7 @@ WRONG = {
     "gain": ("a = 14.87", 'a = "14.87"', "gains.a is '14.87', wanted a number"),
     "one bracket": ("[[validation]]", "[validation]", "wanted tables written as [[validation]]"),
     "no log": ('log = "val.parquet"', "end = 2.0", "a [[validation]] has no key 'log'"),
-    "loop's kind": ('"point"', '"ball"', "loop hand, rod is 'ball', wanted one of point, hinge"),
+    "loop's kind": ('"point"', '"ball"', "loop hand, rod: kind is 'ball', wanted one of point"),
     "loop's frames": ('["hand", "rod"]', '["hand"]', "loop.frames has 1 entries, wanted 2"),
     "no frames": ('frames = ["hand", "rod"]', "", "a [[loop]] has no key 'frames'"),
     "loop's axis": ('"point"', '"hinge"\naxis = [0, 1]', "loop.axis has 2 entries, wanted 3"),

@@ -25,7 +25,6 @@ def test_costs_are_those_of_the_augmented_lagrangian_and_slopes_their_derivative
     np.testing.assert_allclose(raised.limits, own.of_limits(used)[1])
     np.testing.assert_allclose(raised.distances, own.of_distances(distance, aim)[1])
     assert own.raised(used, None, aim).distances == 0.0
-    assert own.increased().weight == 7.5
     edge = own.distance_without_cost(aim)
     assert own.of_distances(edge, aim)[1] == pytest.approx(np.zeros((3, 5)), abs=1e-12)
     assert (own.of_distances(edge - 1e-6, aim)[1] > 0).all()

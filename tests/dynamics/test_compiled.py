@@ -18,7 +18,7 @@ from robotid.robot.model import RobotModel
 def source(model, trajectory, engine=COMPILED, weights=None):
     weights = np.ones(trajectory.v.shape) if weights is None else weights
     kept = np.arange(len(model.layout.names))
-    return TrajectoryRows(model, trajectory, weights, model.support(), kept, engine)
+    return TrajectoryRows(model, trajectory, weights, model.support, kept, engine)
 
 
 def stacked(source, start=0, stop=None):

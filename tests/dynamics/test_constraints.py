@@ -107,9 +107,11 @@ def test_a_wrench_with_the_axes_of_its_link(quadruped, rng):
             rows = slice(3 * i, 3 * i + 3)
             np.testing.assert_allclose(own[k, rows], R.T @ world[k, rows], atol=1e-12)
         np.testing.assert_allclose(own[k, 12:], R.T @ world[k, 12:], atol=1e-12)
-    with pytest.raises(SettingsError, match="axes of the contact 'a' is 'foot', wanted 'world' or"):
+    with pytest.raises(
+        SettingsError, match="contact 'a': axes is 'foot', wanted one of world, link"
+    ):
         Contact("a", axes="foot")
-    with pytest.raises(SettingsError, match="threshold of the contact 'a' is 'x', wanted a force"):
+    with pytest.raises(SettingsError, match=r"contact 'a': threshold is 'x', wanted a force \[N\]"):
         Contact("a", threshold="x")
 
 
@@ -283,12 +285,15 @@ def test_contacts_state_what_logs_have(quadruped):
 @pytest.mark.parametrize(
     ("contact", "message"),
     [
-        (lambda: Contact("a", "line"), "kind of contact 'a' is 'line', wanted one of point"),
+        (lambda: Contact("a", "line"), "contact 'a': kind is 'line', wanted one of point, surface"),
         (lambda: Contact("a", measured=("mx",)), "measured of the point contact 'a' has 'mx'"),
         (lambda: Contact("a", measured=("fx", "fx")), "some of fx, fy, fz, each once"),
-        (lambda: Contact("a", radius=-0.1), "radius of the point contact 'a' is -0.1, wanted a"),
+        (
+            lambda: Contact("a", radius=-0.1),
+            "contact 'a': radius is -0.1, wanted a length [m], at least 0",
+        ),
         (lambda: Contact("a", "surface", radius=0.1), "radius of the surface contact 'a' is 0.1"),
-        (lambda: Contact("a", radius="2 cm"), "radius of a contact is '2 cm', a str, wanted a"),
+        (lambda: Contact("a", radius="2 cm"), "contact 'a': radius is '2 cm', wanted a length [m]"),
         (lambda: Loop(("a", "a")), "loop has the frames a, a, wanted two links"),
         (lambda: Loop(("a", "b"), axis=(0, 0, 0)), "is (0, 0, 0), wanted x, y, z"),
     ],

@@ -106,9 +106,9 @@ def test_support_is_where_the_regressor_can_be_non_zero(free_flyer, rng):
     )
     W = random_regressor(model, 30, rng).reshape(30, model.n_rows, -1)
     seen = np.abs(W).max(axis=0) > 1e-12
-    assert not (seen & ~model.support()).any()
+    assert not (seen & ~model.support).any()
     # and not much more: a body's ten columns are all allowed where one is seen
-    assert model.support().sum() < 2 * seen.sum()
+    assert model.support.sum() < 2 * seen.sum()
 
 
 def trajectory(model, rng, samples=1200):
@@ -200,7 +200,7 @@ def test_columns_of_what_is_carried_are_those_of_the_regressor(ur5, rng, name):
     q, v, a = rng.uniform(-1.0, 1.0, (3, 40, n))
     Y = joint_torque_regressor(model, q, v, a).reshape(40, model.n_rows, -1)
     inertial = Y[:, :, : model.layout.n_inertial]
-    carried = model.support()[:, : model.layout.n_inertial]
+    carried = model.support[:, : model.layout.n_inertial]
     np.testing.assert_array_equal(carried_columns(model, q, v, a), inertial[:, carried])
     assert not inertial[:, ~carried].any()
     v[3, 1] = np.nan

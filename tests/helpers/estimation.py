@@ -65,7 +65,7 @@ class RandomStates(Case):
         self._describe(model, Trajectory(t, q, v, a, tau, model.joints, 50.0, segment), None)
         columns = self.mapping.independent
         block = (W[:, columns], W[:, columns] @ self.beta, np.ones(len(W)))
-        mass, support = mass_regressor(model, q)[..., columns], model.support()[:, columns]
+        mass, support = mass_regressor(model, q)[..., columns], model.support[:, columns]
         self.problem = Problem(
             lambda: iter([block]), self.mapping.base_names, n, support, lambda: iter([mass])
         )

@@ -83,8 +83,8 @@ EFFECTS = {
     "windup": Effect("backlash", _windup),
     "drift": Effect("drift", _drift),
 }
-#: What the doctor names before a fit.
-BALANCING = {"balancing": Effect("counterbalance", _balancing)}
+#: What other masses can imitate.
+BALANCING = {"balancing": Effect("spring", _balancing)}
 
 
 def coloured(rng, shape, memory):

@@ -8,10 +8,9 @@ import pytest
 from helpers.robots import ROBOTS, motion, possible_parameters
 
 from robotid.dynamics.prediction import predict_instants
-from robotid.robot.as_pinocchio import pinocchio_model
 from robotid.robot.drives import Cubic, LoadFriction
 from robotid.robot.examples import example_urdf
-from robotid.robot.model import RobotModel
+from robotid.robot.model import RobotModel, pinocchio_model
 from robotid.robot.parameters import Coupling
 
 OWN = Coupling("bearing", (("elbow_joint", -2.0),))

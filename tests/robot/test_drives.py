@@ -44,7 +44,6 @@ from robotid.robot.drives import (
     Tanh,
     drive_line,
     has_turned,
-    spring_family,
     term_from_dict,
 )
 from robotid.robot.examples import example_urdf
@@ -160,7 +159,7 @@ def test_compiled_instant_and_plain_rows_are_one(model, term, rng):
         at_once = InstantRegressor(model, kept)
         np.testing.assert_allclose(at_once(x.q[3], x.v[3], x.a[3]), W[3], atol=1e-12)
     for engine in (COMPILED, "Pinocchio"):
-        rows = TrajectoryRows(model, x, 2 + np.cos(x.q), model.support(), kept, engine)
+        rows = TrajectoryRows(model, x, 2 + np.cos(x.q), model.support, kept, engine)
         blocks = [[own.copy() for own in block] for block in rows.blocks(0, 70)]
         for j, parts in enumerate(zip(*blocks, strict=True)):
             expected = np.column_stack([W[:, j, rows.columns[j]], x.tau[:, j]])
@@ -340,9 +339,9 @@ def test_a_trajectory_without_its_memory_is_refused(rng):
     [
         ({"term": "Stribek"}, "term is 'Stribek', wanted one of .*Stribeck"),
         ({"term": "Stribeck", "sped": 1.0}, "Stribeck has no 'sped'; it has data_range, speed"),
-        ({"term": "Stribeck", "speed": "x"}, "speed is 'x', wanted a finite number"),
+        ({"term": "Stribeck", "speed": "x"}, "speed is 'x', wanted 1e-09 to 1e.09"),
         ({"term": "Harmonic", "is_sine": 1}, "is_sine is 1, wanted true or false"),
-        ({"term": "Cubic", "data_range": [1.0]}, "data_range is .1.0., wanted .lowest, highest."),
+        ({"term": "Cubic", "data_range": [1.0]}, "data_range is .1.0,., wanted .lowest, highest."),
     ],
 )
 def test_a_term_that_cannot_be_read_is_refused(table, message):
@@ -485,9 +484,6 @@ def test_a_family_is_advised_a_tenth_beyond_the_turns_that_it_needs():
         assert has_turned(name, enough * (1 + 1e-9))
         assert not has_turned(name, enough * (1 - 1e-9))
     assert has_turned("spring", 0.0)
-    for turned, wanted in ((4.0, "harmonics2"), (3.4, "harmonics1"), (0.7, "harmonics1"),
-                           (0.68, "spring")):  # fmt: skip
-        assert spring_family(turned, "harmonics2", "harmonics1") == wanted
 
 
 def test_the_line_of_a_drive_is_read_back_as_it_was():

@@ -105,7 +105,7 @@ def test_what_urdfdom_prints_is_an_error_and_not_on_stderr(tmp_path, monkeypatch
 
 
 def test_what_others_print_meanwhile_is_not_lost(capfd):
-    from robotid.base.native_messages import caught_messages
+    from robotid.robot.model import caught_messages
 
     with caught_messages() as complaints:
         os.write(

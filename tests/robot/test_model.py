@@ -141,7 +141,7 @@ BAD = {
         dict(joints=["elbow"], locked={"elbow": 0.0}),
         "joints elbow are in both joints and locked",
     ),
-    "unknown mimic mode": (dict(mimic="yes"), "mimic is 'yes', wanted 'independent' or 'coupled'"),
+    "unknown mimic mode": (dict(mimic="yes"), "mimic is 'yes', wanted one of independent, coupled"),
     "gravity of two numbers": (dict(gravity=(0, 9.81)), "wanted three finite numbers"),
 }
 

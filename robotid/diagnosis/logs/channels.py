@@ -18,14 +18,23 @@ from robotid.data.measured_velocity import (
 )
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.logs.motion_checks import STILL
+from robotid.diagnosis.decisions import BEYOND_NOISE, SHARE_OF_ROWS
 from robotid.robot.parameters import ParameterLayout
 
-_SPIKE = 15.0  # smallest distance of a spike from its neighbours, over the typical distance
-_BEYOND = 1.5  # ... and over the amplitude of the channel
-_RESTING = 3.0  # [standard deviations of the noise] within which a channel is constant
+#: [rad/s, or m/s of a prismatic joint] slower: at rest.
+AT_REST = 0.02
+#: [rad or m] smaller range: the joint does not move.
+STATIC = 1e-3
+#: Share of the log in which a joint must move.
+MOVING = 0.1
+#: Share of its largest value, below which a torque that is never negative is 0.
+ZERO = 0.05
+#: Largest range of a locked joint, and largest difference from its stated position [rad or m].
+STILL = 0.02
 _LEAST = {"q": 1e-3, "dq": 0.02}  # [rad or m, rad/s or m/s] smaller values: at rest
 _LEAST_TORQUE = 0.01  # share of the median joint's torque below which a torque is negligible
+_SPIKE = 15.0  # smallest distance of a spike from its neighbours, over the typical distance
+_BEYOND = 1.5  # ... and over the amplitude of the channel
 _ABSURD = 5.0  # spike over the amplitude of the channel, above which it cannot be motion
 _HARM = 0.02  # share of a channel's energy in its spikes that ruins a least-squares fit
 _NOISY = 0.3  # noise over signal from which a torque is uninformative
@@ -35,35 +44,28 @@ _SCALE = 1.1  # velocity over d(q)/dt, or the inverse, from which the unit diffe
 _ENCODER = 0.01  # largest difference of a step from 2 pi / 2^bits [bits]
 _BITS = range(9, 24)  # of encoders
 _DEAD = 1e-3  # velocity over d(q)/dt below which the channel is constant
-_JITTER = 0.05  # spread of the time steps over their median from which jitter is reported
+_EVEN = 0.05  # spread of the time steps over their median, or of mean over median, if uneven
 _GAP = 2.5  # [median steps] a longer step is a gap
 _LONG = 0.05  # [s] ... a longer gap is a warning
 _BUNCHED = 0.2  # [median steps] a shorter step is of rows that were stamped together ...
-_BUNCHES = 0.02  # ... which are reported from this share of rows on, if the motion per row in them
-_CLOCK_ALIKE = 0.3  # ... over that of all rows is not below this: they were not recorded together
-_EVEN = 0.05  # relative difference of mean and median step above which rows may be missing
+_CLOCK_ALIKE = 0.3  # ... if the motion per row in them is less than this share of the usual one
 _SET = 1.0  # [s] in a longer gap, a position that moves as in one step shows that the clock was set
 _STALE = 0.05  # share of stale rows from which they are a warning
 _CONTINUES = 0.15  # motion after repeated rows, over that in as many rows before and after it,
 _AROUND = 10  # ... estimated from at most this many rows
-_STILL = 0.02  # [rad/s, or m/s of a prismatic joint] slower: at rest
 _REST = 1.0  # [s] a longer rest at an end is reported
-_STATIC = 1e-3  # [rad or m] smaller range: the joint does not move
-_HARDLY = 0.2  # [rad] smaller range: the joint hardly moves
-_HARDLY_PRISMATIC = 0.05  # [m] the same of a prismatic joint
-_MOVING = 0.1  # share of the log in which a joint must move
+_HARDLY = {"rad": 0.2, "m": 0.05}  # smaller range: the joint hardly moves
 _PLATEAU = 5  # consecutive rows at the limit of a clipped channel, at least
 _CLIPPED = 0.01  # share of the rows at the limit from which a channel is clipped
-_ZERO = 0.05  # of its largest value, below which a torque that is never negative is 0
-_AWAY = 0.2  # of its largest value, above which it is not 0 any more
-_TOUCHES = 3  # times that a torque without sign reaches 0 and increases again, at least
-_ALL = 3  # joints of which no torque is ever negative, at least
+_AWAY = 0.2  # of its largest value, above which a torque is not 0 any more
+_SEVERAL = 3  # torques without sign, and times that each reaches 0 and increases again, at least
 _REGULAR = 0.8  # share of holds of about one length that a quantised torque does not reach
 
 
 def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
     """Yield the findings on the sensors behind the channels of a log."""
-    channels = dict(_channels(log))
+    every = {"q": log.q, "dq": log.v, "tau": log.tau if log.has_torque else None}
+    channels = {kind: values for kind, values in every.items() if values is not None}
     noise = {kind: _white_noise(log.t, values) for kind, values in channels.items()}
     for kind, values in channels.items():
         yield from _quantisation(log, kind, values, signals.velocity)
@@ -113,16 +115,20 @@ def _spikes(
     log: Log, kind: str, values: Array, noise: Array, *, is_used: bool = True
 ) -> Iterator[Finding]:
     """Yield rows that differ strongly from both neighbours."""
-    smooth = _without_spikes(values)
+    from scipy.ndimage import median_filter  # takes long to import
+
+    smooth = median_filter(values, size=(5, 1), mode="nearest")
     amplitudes = [_amplitude(*of) for of in zip(values.T, smooth.T, noise, strict=True)]
     least = _LEAST.get(kind, _LEAST_TORQUE * float(np.median(amplitudes)))
     for j, (joint, x) in enumerate(zip(log.joints, values.T, strict=True)):
-        amplitude = max(amplitudes[j], least)
-        rows, height = _jumps(x - smooth[:, j], noise[j], amplitude)
+        amplitude, deviation = max(amplitudes[j], least), x - smooth[:, j]
+        typical = max(1.48 * float(np.median(np.abs(deviation))), noise[j])
+        smallest = max(_BEYOND * amplitude, _SPIKE * typical)
+        rows = np.flatnonzero(np.abs(deviation) > smallest)
         if len(rows) == 0:
             continue
-        largest, first = np.abs(height).max(), float(log.t[rows[0]])
-        energy = np.sum(height**2) / np.sum((x - np.median(x)) ** 2)
+        largest, first = np.abs(deviation[rows]).max(), float(log.t[rows[0]])
+        energy = np.sum(deviation[rows] ** 2) / np.sum((x - np.median(x)) ** 2)
         is_harmful = is_used and largest > _ABSURD * amplitude and energy > _HARM
         yield finding(
             "spikes", log.name, joint, subject=f"{kind}_{joint}", channel=kind,
@@ -146,9 +152,9 @@ def _velocity_order(log: Log, alike: Array) -> Iterator[Finding]:
     """Yield joints whose measured velocity is the derivative of another joint's position."""
     for j, joint in enumerate(log.joints):
         k = int(np.argmax(alike[j]))
-        found, own = alike[j, k], alike[j, j]
-        if k != j and found >= _ALIKE and own <= 0.5 * found:
-            evidence = {"correlation": found, "own_correlation": own}
+        largest, own = alike[j, k], alike[j, j]
+        if k != j and largest >= _ALIKE and own <= 0.5 * largest:
+            evidence = {"correlation": largest, "own_correlation": own}
             yield finding("velocity_order", log.name, joint, other=log.joints[k], **evidence)
 
 
@@ -169,7 +175,7 @@ def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
     scatter = float(np.median(np.abs(used - lag))) * 1.48 if len(used) else 0.0
     step = float(np.median(np.diff(log.t)))
     error = max(scatter / np.sqrt(max(len(used), 1)), 0.02 * step)
-    if abs(lag) < max(_LAG, 3 * error, 0.1 * step):
+    if abs(lag) < max(_LAG, BEYOND_NOISE * error, 0.1 * step):
         return
     is_delayed = abs(lag) >= LARGEST_LAG
     yield finding(
@@ -206,27 +212,9 @@ def _slopes(log: Log, velocity: Array) -> tuple[Array, Array]:
     median = np.median(step)
     is_regular = ((step > median / 5) & (step < 5 * median))[:, 0]
     every = max(1, len(step) // 20000)
-    slope, v = (
-        np.diff(np.unwrap(log.q, axis=0), axis=0) / step,
-        0.5 * (velocity[1:] + velocity[:-1]),
-    )
+    slope = np.diff(np.unwrap(log.q, axis=0), axis=0) / step
+    v = 0.5 * (velocity[1:] + velocity[:-1])
     return slope[is_regular][::every], v[is_regular][::every]
-
-
-def _channels(log: Log) -> Iterator[tuple[str, Array]]:
-    for kind, values in (("q", log.q), ("dq", log.v), ("tau", log.tau)):
-        if values is not None and (kind != "tau" or log.has_torque):
-            yield kind, values
-
-
-def _jumps(deviation: Array, noise: float, amplitude: float) -> tuple[Array, Array]:
-    """Return the rows that differ strongly from their neighbours, and their deviations."""
-    size = np.abs(deviation)
-    rows = np.flatnonzero(size > _BEYOND * amplitude)
-    if len(rows):
-        typical = max(1.48 * float(np.median(size)), noise)
-        rows = rows[size[rows] > _SPIKE * typical]
-    return rows, deviation[rows]
 
 
 def _amplitude(x: Array, smooth: Array, noise: float) -> float:
@@ -236,20 +224,9 @@ def _amplitude(x: Array, smooth: Array, noise: float) -> float:
     """
     median = np.median(x)
     away = np.abs(smooth - median)
-    away = away[away > _RESTING * noise]
+    away = away[away > BEYOND_NOISE * noise]
     distance = np.abs(x - median)
     return max(float(np.quantile(part, 0.995)) for part in (distance, away) if len(part))
-
-
-def _without_spikes(x: Array) -> Array:
-    """Return the running median over five rows, shape (N, n)."""
-    padded = np.pad(x, ((2, 2), (0, 0)), mode="edge")
-    a, b, c, d, e = (padded[k : len(x) + k] for k in range(5))
-    # the median of five is the median of e and of the middle two of the others
-    low = np.maximum(np.minimum(a, b), np.minimum(c, d))
-    high = np.minimum(np.maximum(a, b), np.maximum(c, d))
-    middle: Array = np.maximum(np.minimum(low, high), np.minimum(np.maximum(low, high), e))
-    return middle
 
 
 def _white_noise(t: Array, values: Array) -> Array:
@@ -271,8 +248,7 @@ def _correlation(one: Array, other: Array) -> Array:
     """Return the correlation of each column with each of the other, shape (n, n)."""
     a, b = one - one.mean(axis=0), other - other.mean(axis=0)
     size = np.outer(np.linalg.norm(a, axis=0), np.linalg.norm(b, axis=0))
-    found: Array = np.divide(a.T @ b, size, out=np.zeros_like(size), where=size > 0)
-    return found
+    return np.asarray(np.divide(a.T @ b, size, out=np.zeros_like(size), where=size > 0))
 
 
 def check_clock(log: Log) -> Iterator[Finding]:
@@ -289,14 +265,21 @@ def check_rest(log: Log, motion: Trajectory, layout: ParameterLayout) -> Iterato
     """Yield the rests at the ends of a log, and the joints that do not move or hardly move."""
     speed = np.abs(motion.v) / layout.drive_speeds[: len(log.joints)]
     # a prismatic joint that moves by a millimetre is at rest, too
-    yield from _standstill(log, motion.t[(np.abs(motion.v) > _STILL).any(axis=1)])
+    moving = motion.t[(np.abs(motion.v) > AT_REST).any(axis=1)]
+    before = after = 0.0
+    if len(moving):
+        before, after = float(moving[0] - log.t[0]), float(log.t[-1] - moving[-1])
+    if max(before, after) >= _REST:
+        yield finding(
+            "standstill", log.name, before=before, after=after, start=seconds(moving[0]),
+            end=seconds(moving[-1]),
+        )  # fmt: skip
     for j, joint in enumerate(log.joints):
         extent = float(np.ptp(motion.q[:, j]))
-        share = float(np.mean(speed[:, j] > _STILL))
-        is_prismatic = joint in layout.prismatic
-        unit, least = ("m", _HARDLY_PRISMATIC) if is_prismatic else ("rad", _HARDLY)
-        code = "static_joint" if extent < _STATIC else "hardly_moves"
-        if extent < least or share < _MOVING:
+        share = float(np.mean(speed[:, j] > AT_REST))
+        unit = "m" if joint in layout.prismatic else "rad"
+        code = "static_joint" if extent < STATIC else "hardly_moves"
+        if extent < _HARDLY[unit] or share < MOVING:
             yield finding(code, log.name, joint, range=extent, moving_share=share, unit=unit)
 
 
@@ -312,7 +295,7 @@ def _rate(log: Log, step: Array, median: float) -> Iterator[Finding]:
     yield finding("rate", log.name, rate=rate, samples=len(log.t), duration=duration)
     regular = step[step < _GAP * median]
     spread = float(np.std(regular)) / median
-    if spread > _JITTER:
+    if spread > _EVEN:
         yield finding(
             "jitter", log.name, relative_spread=spread, shortest=float(step.min()),
             longest=float(regular.max()), median=median,
@@ -321,9 +304,7 @@ def _rate(log: Log, step: Array, median: float) -> Iterator[Finding]:
 
 def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
     gaps = np.flatnonzero(step > _GAP * median * (1 + 1e-6))
-    is_set = np.array(
-        [step[k] > _SET and _goes_on(log.q, k) for k in gaps.tolist()], dtype=np.bool_
-    )
+    is_set = np.array([step[k] > _SET and _goes_on(log.q, k) for k in gaps.tolist()], dtype=bool)
     if is_set.any():
         k = int(gaps[is_set][0])
         jump, at = float(step[k]) - median, float(log.t[k])
@@ -347,7 +328,7 @@ def _bunches(log: Log, step: Array) -> Iterator[Finding]:
     share = float(np.mean(is_bunched))
     moved = np.abs(np.diff(log.q, axis=0)).mean(axis=0)
     change = np.abs(np.diff(log.q[:, int(np.argmax(moved))]))  # of the joint that moves most
-    if share < _BUNCHES or change[is_bunched].mean() <= _CLOCK_ALIKE * change.mean():
+    if share < SHARE_OF_ROWS or change[is_bunched].mean() <= _CLOCK_ALIKE * change.mean():
         return
     usual = float(np.median(step[~is_bunched]))
     yield finding(
@@ -362,8 +343,8 @@ def _goes_on(q: Array, k: int) -> bool:
     if not 2 <= k < len(q) - 3:
         return False
     around = (q[k] - q[k - 2] + q[k + 3] - q[k + 1]) / 4
-    own, size = q[k + 1] - q[k], float(np.linalg.norm(around))
-    return size > 0 and float(np.linalg.norm(own - around)) < 0.5 * size
+    change, size = q[k + 1] - q[k], float(np.linalg.norm(around))
+    return size > 0 and float(np.linalg.norm(change - around)) < 0.5 * size
 
 
 def _stale_rows(log: Log, step: Array) -> Iterator[Finding]:
@@ -393,7 +374,7 @@ def _in_motion(log: Log, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
     m = np.minimum(n, _AROUND)
     around = np.linalg.norm(q[first] - q[np.maximum(first - m, 0)], axis=1)
     around += np.linalg.norm(q[np.minimum(last + 1 + m, last_row)] - q[last + 1], axis=1)
-    moves = np.abs(change).max(axis=1, initial=0.0) > _STILL * (t[last + 1] - t[first])
+    moves = np.abs(change).max(axis=1, initial=0.0) > AT_REST * (t[last + 1] - t[first])
     if not log.has_torque:
         steps = np.array([quantum(x) for x in q.T])
         moves &= (np.abs(change) > 1.5 * steps).any(axis=1)
@@ -402,25 +383,16 @@ def _in_motion(log: Log, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
     return list(zip(first[rows].tolist(), last[rows].tolist(), strict=True))
 
 
-def _standstill(log: Log, moving: Array) -> Iterator[Finding]:
-    """Yield the rests at the ends of a log, from the times at which the robot moves."""
-    if len(moving) == 0:
-        return
-    before, after = float(moving[0] - log.t[0]), float(log.t[-1] - moving[-1])
-    if max(before, after) >= _REST:
-        yield finding(
-            "standstill", log.name, before=before, after=after, start=seconds(moving[0]),
-            end=seconds(moving[-1]),
-        )  # fmt: skip
-
-
 def check_torque_channels(log: Log) -> Iterator[Finding]:
     """Yield the findings on the torque sensors behind a log."""
     moving = np.append((np.diff(log.q, axis=0) != 0).any(axis=1), False)
     for joint, x in zip(log.joints, log.tau.T, strict=True):
-        own = bool(np.ptp(log.q[:, log.joints.index(joint)]) > STILL)
-        yield from _clipping(log, joint, x, moving, moves=own)
-    yield from _unsigned(log)
+        moves = bool(np.ptp(log.q[:, log.joints.index(joint)]) > STILL)
+        yield from _clipping(log, joint, x, moving, moves=moves)
+    # a single torque that is never negative may be of a joint that gravity loads in one direction
+    touching = sum(_touches(x) >= _SEVERAL for x in log.tau.T)
+    if log.tau.min() >= 0 and touching >= _SEVERAL:
+        yield finding("unsigned_torque", log.name, joints=touching, kind="all", cure="all")
     yield from _held(log)
 
 
@@ -429,10 +401,8 @@ def _clipping(log: Log, joint: str, x: Array, moving: Array, *, moves: bool) -> 
     if moving.any() and np.ptp(x) == 0:
         value = float(x[0]) + 0.0  # no -0
         kind = "undriven" if moves and value == 0.0 else "dead"
-        name = quoted(joint)
-        yield finding(
-            "constant_torque", log.name, joint, value=value, kind=kind, cure=kind, quoted=name
-        )
+        words = {"kind": kind, "cure": kind, "quoted": quoted(joint)}
+        yield finding("constant_torque", log.name, joint, value=value, **words)
         return
     step = quantum(x)
     for limit in (float(x.max()), float(x.min())):
@@ -444,21 +414,11 @@ def _clipping(log: Log, joint: str, x: Array, moving: Array, *, moves: bool) -> 
             yield finding("clipped", log.name, joint, limit=limit, share=share)
 
 
-def _unsigned(log: Log) -> Iterator[Finding]:
-    """Yield a finding if no torque is ever negative although several reach 0 repeatedly.
-
-    A single such torque may belong to a joint that gravity loads in one direction only.
-    """
-    touching = sum(_touches(x) >= _TOUCHES for x in log.tau.T)
-    if log.tau.min() >= 0 and touching >= _ALL:
-        yield finding("unsigned_torque", log.name, joints=touching, kind="all", cure="all")
-
-
 def _touches(x: Array) -> int:
     """Return how often a torque reaches 0 and increases again."""
     top = float(np.quantile(np.abs(x), 0.995))
     near = runs_of(x < _AWAY * top)
-    return sum(x[i:k].min() < _ZERO * top for i, k in near if i > 0 and k < len(x))
+    return sum(x[i:k].min() < ZERO * top for i, k in near if i > 0 and k < len(x))
 
 
 def _held(log: Log) -> Iterator[Finding]:

@@ -4,39 +4,50 @@ Findings never change data. An error is a fault that makes the result wrong; it 
 identification unless its code is ignored.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from robotid.base.exceptions import DataError
-from robotid.base.findings import Finding, by_severity
+import numpy as np
+
+from robotid.base.exceptions import DataError, RobotIdError
+from robotid.base.findings import Finding, by_severity, toml_key
 from robotid.base.settings import require_kind
+from robotid.base.typing import Array
+from robotid.data.alike_motions import REPEATED, repeated_share
 from robotid.data.files.read import Readable, read_logs
 from robotid.data.log import Log, Trajectory
-from robotid.data.signal_settings import SignalSettings
+from robotid.data.signal_settings import LogUnits, SignalSettings
 from robotid.diagnosis.catalogue import finding
+from robotid.diagnosis.logs.base_checks import check_base
 from robotid.diagnosis.logs.channels import (
+    STILL,
     check_channels,
     check_clock,
     check_rest,
     check_torque_channels,
 )
 from robotid.diagnosis.logs.command_channels import check_commands
-from robotid.diagnosis.logs.contacts import check_base
-from robotid.diagnosis.logs.loads import Segments, check_payload_change
-from robotid.diagnosis.logs.motion_checks import check_excitation, check_repeated_motion
-from robotid.diagnosis.logs.torque_checks import check_torques
+from robotid.diagnosis.logs.hypotheses import Probe, smooth_motion, take_probe
+from robotid.diagnosis.logs.torque_checks import Segments, check_payload_change, check_torques
 from robotid.diagnosis.logs.torque_delay import check_torque_delay
-from robotid.diagnosis.logs.torque_sample import Probe, smooth_motion, take_probe
-from robotid.diagnosis.urdf.inertials import (
-    assumed_inertials,
-    explained_by_assumed,
-    rounded_angles,
-)
-from robotid.dynamics.base_parameters import structural_mapping
+from robotid.diagnosis.urdf.inertials import assumed_inertials, explained_by_assumed, rounded_angles
+from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.constraint_rows import logged_base
+from robotid.dynamics.factors import compress, merge
+from robotid.dynamics.used_rows import base_problem, independent_share, row_mask
+from robotid.estimation.estimators import WLS, Estimate
+from robotid.estimation.estimators.determination import (
+    Determination,
+    base_spread,
+    determine,
+    is_poorly_excited,
+)
 from robotid.robot.model import RobotModel
-from robotid.robot.prior import with_assumed_inertials
+from robotid.robot.prior import prior_spread, with_assumed_inertials
+
+_ROWS = 5000  # of a log, from which its excitation is computed
+_FAR = 2 * np.pi  # number in a log above which a position may be a percentage
 
 
 def check_logs(
@@ -46,36 +57,16 @@ def check_logs(
     validation: Readable | Sequence[Readable] = (),
     signals: SignalSettings | None = None,
 ) -> tuple[Finding, ...]:
-    """Check logs for faults before an identification.
-
-    Args:
-        model: The robot.
-        logs: Logs to fit, one or several: of the model's joints in its order, or paths or
-            DataFrames with their columns.
-        validation: Validation logs, likewise.
-        signals: How logs become trajectories; the defaults if None.
-
-    Returns:
-        The findings, errors first. Each has a code, a severity, a place and a message.
-
-    Raises:
-        DataError: If a file or a DataFrame is no log.
-        SettingsError: If a setting does not fit a log.
-    """
+    """Return the faults of logs, or of paths or DataFrames with their columns, errors first."""
     require_kind(model, RobotModel, "model", "a robotid.RobotModel")
     require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
     first, second = (
         read_logs(
-            some,
-            model.joints,
-            prismatic=model.layout.prismatic,
-            needs="any",
-            base=logged_base(model),
-            passive=model.passive,
-            robot=model.tree.movable,
+            some, model.joints, prismatic=model.layout.prismatic, needs="any",
+            base=logged_base(model), passive=model.passive, robot=model.tree.movable,
         )
         for some in (logs, validation)
-    )
+    )  # fmt: skip
     return diagnose(model, first, second, signals or SignalSettings())
 
 
@@ -93,11 +84,12 @@ def diagnose(
     moving = [probe.motion for probe in probes]
     segments = Segments(model, mapping, moving, signals.min_velocity) if mapping else None
     for log, (motion, probe) in zip(validation, motions[len(fitted) :], strict=True):
-        if motion is not None:
-            findings += check_repeated_motion(first, motion, log.name)
+        share = 0.0 if motion is None else repeated_share(first, motion)
+        if share >= REPEATED:
+            findings.append(finding("repeated_motion", log.name, share=share))
         if probe is not None and segments is not None:
-            own = replace(segments, motions=[probe.motion])
-            findings += check_payload_change(segments, own, signals, log.name)
+            other = replace(segments, motions=[probe.motion])
+            findings += check_payload_change(segments, other, signals, log.name)
     if mapping is not None:
         names = ", ".join(log.name for log in fitted)
         findings += check_excitation(model, mapping, moving, signals, names)
@@ -108,12 +100,9 @@ def diagnose(
 def findings_to_dict(findings: Sequence[Finding]) -> dict[str, Any]:
     """Return findings as plain values, as ``robotid doctor --json`` prints them."""
     keys = ("code", "severity", "where", "message")
-    plain = [
-        {key: getattr(one, key) for key in keys}
-        | {"evidence": {key: float(x) for key, x in one.evidence.items()}}
-        for one in findings
-    ]
-    return {"findings": plain}
+    evidence = [{key: float(x) for key, x in one.evidence.items()} for one in findings]
+    plain = [{key: getattr(one, key) for key in keys} for one in findings]
+    return {"findings": [x | {"evidence": y} for x, y in zip(plain, evidence, strict=True)]}
 
 
 def _examine_log(
@@ -156,3 +145,90 @@ def _examine_log(
     if not any(x.severity == "error" for x in torques):
         findings += check_torque_delay(model, log, signals, name)
     return motion, probe
+
+
+def check_excitation(
+    model: RobotModel, mapping: BaseMapping, motions: Sequence[Trajectory],
+    signals: SignalSettings, name: str,
+) -> Iterator[Finding]:  # fmt: skip
+    """Yield which base parameters the fitted motions determine, by ``determine``.
+
+    Of long logs every n-th row is used.
+    """
+    prior, step = model.standard_parameters(), -(-max(len(m.t) for m in motions) // _ROWS)
+    thinned = [motion.every(step) for motion in motions]
+    try:
+        masks = [row_mask(model, m, signals.min_velocity) for m in thinned]
+        problems = (
+            base_problem(model, mapping, *pair) for pair in zip(thinned, masks, strict=True)
+        )
+        factors = merge([compress(problem) for problem in problems])
+        wls = WLS(prior=mapping.to_base(prior)).fit(factors)
+    except RobotIdError as error:
+        yield finding(
+            "excitation", name, severity="warning", what="unchecked", todo="unchecked",
+            text=str(error),
+        )  # fmt: skip
+        return
+    share = step * min(independent_share(replace(signals, rate=m.rate)) for m in motions)
+    squares = np.sum([motion.squares for motion in thinned], axis=0)
+    spread = prior_spread(model, squares, sum(len(motion.t) for motion in thinned))
+    rows = factors.weighted(wls.sigma / np.sqrt(share))[:, :-1]
+    known = determine(mapping.base_names, rows, base_spread(mapping.K, spread))
+    yield excitation_finding(wls, known, name)
+
+
+def excitation_finding(wls: Estimate, known: Determination, name: str) -> Finding:
+    """Return the finding on which base parameters a motion determines."""
+    count = len(known.names)
+    evidence = {"rank": known.rank, "base": count, "weakest": known.shrinkage[-1]}
+    if np.isfinite(wls.condition):
+        evidence["condition"] = wls.condition
+    is_poor = is_poorly_excited(wls, count)
+    todo = "poor" if is_poor else "lost"
+    if not known.groups:
+        todo = "weak" if is_poor else "good"
+    return finding(
+        "excitation", name, severity="warning" if todo == "poor" else "note", what="rank",
+        todo=todo, described=known.described() if known.groups else "",
+        condition_number=f"{wls.condition:.3g}", **evidence,
+    )  # fmt: skip
+
+
+def check_locked(
+    model: RobotModel, positions: Mapping[str, Array], log: str, asked: Collection[str],
+    units: LogUnits,
+) -> Iterator[Finding]:  # fmt: skip
+    """Yield an error "locked_position" per locked joint that moves or has another position."""
+    types = {joint.name: joint.type for joint in model.tree.movable}
+    for joint, q in positions.items():
+        stated = model.locked[joint]
+        middle, extent = float(np.median(q)), float(np.ptp(q))
+        if extent <= STILL and abs(middle - stated) <= STILL:
+            continue
+        what = "moves" if extent > STILL else "stands"
+        yield finding(
+            "locked_position", log, joint, what=what, todo=what, default=joint in asked,
+            unit="m" if types[joint] == "prismatic" else "rad", stated=stated, median=middle,
+            range=extent,
+            setting=f"locked = {{ {joint} = {middle:.4g} }}", flag=f"--lock {joint}={middle:.4g}",
+            percent=percent_hint(model, joint, middle, units),
+        )  # fmt: skip
+
+
+def percent_hint(model: RobotModel, name: str, position: float, units: LogUnits) -> str:
+    """Return what to state if the position of a gripper is a percentage; "" if it cannot be one."""
+    joint = next(joint for joint in model.tree.movable if joint.name == name)
+    first, scale = units.scale(name, is_angle=joint.type != "prismatic")
+    logged = (position - first) / scale
+    moves = any(other.parent == joint.child for other in model.tree.movable)
+    if name in units.percent or moves or not joint.has_limits or not _FAR < logged <= 100:
+        return ""
+    low, high = joint.lower, joint.upper
+    unit = "m" if joint.type == "prismatic" else "rad"
+    return (
+        f". If {logged:.4g}, the number in the log, is a percentage, as of LeRobot's grippers, "
+        f"state percent = {{ {toml_key(name)} = [{low:.4g}, {high:.4g}] }} in [units], the "
+        f"positions at 0 and at 100 [{unit}]: it then is at "
+        f"{low + (high - low) * logged / 100:.4g} {unit}"
+    )

@@ -12,7 +12,9 @@ from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.data.measured_velocity import quantum
 from robotid.diagnosis.catalogue import finding
+from robotid.diagnosis.decisions import CORRELATED, SHARE_OF_ROWS, SIGNIFICANT
 from robotid.diagnosis.logs.channels import runs_of
+from robotid.estimation.fitting.standard_errors import QUANTILE
 
 _SECONDS = 5.0  # [s] length of the segments whose spectra are averaged
 _GAP = 5  # [median steps] a longer step ends the segment that is examined
@@ -24,18 +26,14 @@ _RIPPLE = 5  # number of frequencies over which the size of a response is smooth
 _DELAYS = np.arange(0.0, 0.2, 0.001)  # [s] grid of the delays
 _LONGEST = 0.5  # [s] longest delay, or lead, of the position
 _AS_ALIKE = 0.9  # share of the largest correlation that counts as equal to it
-_QUANTILE = 3.84  # 95 % quantile of chi-square with one degree of freedom
 _DETERMINED = 0.02  # [s] width of the range of delays below which a delay is determined
-_RATE = 10.0  # least number of rows per period of the bandwidth
-_ALIKE = 0.95  # correlation from which two commands are proportional
 _UPDATED = 1.5  # [rows] mean time between updates from which a command is zero-order held
-_LEVELS = 20  # number of values from which a command is smooth, not a series of steps
-_PAUSE = 20  # [rows] a longer constant command is intended
+_MANY = 20  # values of a smooth command; rows of a constant one that is intended
 _INTERVAL = 0.1  # [s] over which changes of commands are compared
 _FOLLOWED = 0.5  # share of slow sweeps that a joint should follow
 _STUCK = 0.2  # ... if its lag is unknown, so that it is unknown which sweeps are slow
 _SLOW = 5.0  # [lags] least duration of a slow sweep
-_FEW = 10.0  # least number of encoder steps in a sweep
+_RESOLVED = 10.0  # least number of encoder steps in a sweep, and of rows per period
 _SWEEPS = 4  # least number of sweeps to judge a joint by
 _SETTLED = 0.5  # [s] after its last change a command is constant
 _CONSTANT = 2.0  # [s] least total time of constant command
@@ -43,16 +41,15 @@ _DISTURBED = 0.01  # [rad or m] motion that is allowed under a constant command
 _EXPLAINED = 0.7  # share of this motion that the other joints must explain
 _TOP = 0.1  # relative distance from the largest speed within which a joint runs at it
 _FLAT = 0.6  # least share at the largest speed, of the rows above half of it; a sine has 0.43
-_OFTEN = 0.02  # share of the rows at the largest speed from which it is reported
 _UNLIKE = 0.2  # least relative difference between this speed and the speed of the command
-_LEADS = 5.0  # standard errors by which a joint moves before its command
 _PULSES = 3  # least number of movements that end at one speed
 
 
 def check_commands(log: Log, prismatic: Collection[str] = ()) -> Iterator[Finding]:
     """Yield the findings on the position loops of the joints."""
     if not log.has_torque:
-        yield _without_torque(log)
+        what = "commands" if log.q_ref is not None else "forces" if log.wrenches else "nothing"
+        yield finding("no_torque", log.name, what=what)
     if log.q_ref is None:
         return
     loops = [
@@ -62,7 +59,12 @@ def check_commands(log: Log, prismatic: Collection[str] = ()) -> Iterator[Findin
     yield from _shown(log, moved)
     yield from _held(log, moved)
     yield from _alike(log, moved)
-    early = list(_early(log, moved))
+    early = []
+    for loop in moved:  # a joint that moves before its command
+        lag, error = loop.lag
+        if lag < -max(SIGNIFICANT * error, loop.step):
+            words = {"lag": lag, "lead": -lag, "std_error": error}
+            early.append(finding("delayed_command", log.name, loop.name, **words))
     clipped = dict(_saturated(log, moved))
     small = list(_small(log, [loop for loop in moved if loop.name not in clipped]))
     yield from (*early, *clipped.values(), *small)
@@ -75,7 +77,7 @@ def check_commands(log: Log, prismatic: Collection[str] = ()) -> Iterator[Findin
 def largest_speeds(log: Log) -> dict[str, float]:
     """Return the speeds of the joints that run at their largest speed for any position error."""
     moved = [loop for j in range(len(log.joints)) if (loop := _Loop(log, j)).is_commanded]
-    return {name: float(found.evidence["speed"]) for name, found in _saturated(log, moved)}
+    return {name: float(one.evidence["speed"]) for name, one in _saturated(log, moved)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,15 +108,13 @@ class _Loop:
     @property
     def q(self) -> Array:
         """Positions, shape (N,)."""
-        q: Array = self.log.q[self.rows, self.joint]
-        return q
+        return np.asarray(self.log.q[self.rows, self.joint])
 
     @property
     def command(self) -> Array:
         """Commanded positions, shape (N,)."""
         assert self.log.q_ref is not None
-        command: Array = self.log.q_ref[self.rows, self.joint]
-        return command
+        return np.asarray(self.log.q_ref[self.rows, self.joint])
 
     @property
     def is_commanded(self) -> bool:
@@ -209,7 +209,7 @@ class _Loop:
         squares = np.sum(b**2, axis=1) - np.sum((b @ Q) ** 2, axis=1)
         least = squares.min()
         noise = max(float(least) / (2 * len(f) - 4), 1.0)
-        fits = delays[squares < least + _QUANTILE * noise]
+        fits = delays[squares < least + QUANTILE**2 * noise]
         return float(fits[0]), float(fits[-1])
 
     @cached_property
@@ -229,11 +229,6 @@ class _Loop:
         followed = np.array([np.ptp(q[i : k + delay + 1]) for i, k in pairs])
         is_large = swept > 0.2 * swept.max(initial=0.0)
         return swept[is_large], followed[is_large]
-
-
-def _without_torque(log: Log) -> Finding:
-    what = "commands" if log.q_ref is not None else "forces" if log.wrenches else "nothing"
-    return finding("no_torque", log.name, what=what)
 
 
 def _shown(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
@@ -260,11 +255,10 @@ def _held(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     """Yield whether smooth commands are updated less often than they are logged."""
     rows: dict[str, Array] = {}
     for loop in loops:
-        changes = np.flatnonzero(np.diff(loop.command))
-        lengths = np.diff(changes)
-        lengths = lengths[lengths <= _PAUSE]
-        is_smooth = len(np.unique(loop.command)) >= _LEVELS
-        if len(lengths) > 20 and is_smooth and lengths.mean() > _UPDATED:
+        lengths = np.diff(np.flatnonzero(np.diff(loop.command)))
+        lengths = lengths[lengths <= _MANY]
+        is_smooth = len(np.unique(loop.command)) >= _MANY
+        if len(lengths) > _MANY and is_smooth and lengths.mean() > _UPDATED:
             rows[loop.name] = lengths
     if not rows:
         return
@@ -290,7 +284,7 @@ def _alike(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     while left:
         group = [left.pop(0)]
         for k in group:
-            near = [i for i in left if same[k, i] > _ALIKE]
+            near = [i for i in left if same[k, i] > CORRELATED]
             group += near
             left = [i for i in left if i not in near]
         if len(group) > 1:
@@ -299,15 +293,6 @@ def _alike(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
             yield finding(
                 "proportional_commands", log.name, names, correlation=least, joints=len(names)
             )
-
-
-def _early(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
-    """Yield joints that move before their command, which is impossible."""
-    for loop in loops:
-        lag, error = loop.lag
-        if lag < -max(_LEADS * error, loop.step):
-            yield finding("delayed_command", log.name, loop.name, lag=lag, lead=-lag,
-                          std_error=error)  # fmt: skip
 
 
 def _slow(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
@@ -340,8 +325,9 @@ def _small(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
             dead = float(np.median(swept - followed))
             evidence |= {"sweep": float(np.median(swept)), "dead": dead, "wanted": 5 * dead}
             what = "suppressed"
-        elif sweep < _FEW * step:
-            what, evidence = "steps", evidence | {"count": sweep / step, "wanted": 5 * _FEW * step}
+        elif sweep < _RESOLVED * step:
+            evidence |= {"count": sweep / step, "wanted": 5 * _RESOLVED * step}
+            what = "steps"
         else:
             continue
         yield finding("small_command", log.name, loop.name, what=what, unit=loop.unit, **evidence)
@@ -352,7 +338,7 @@ def _saturated(log: Log, loops: Sequence[_Loop]) -> Iterator[tuple[str, Finding]
     for loop in loops:
         v, wanted = np.gradient(loop.q, loop.step), np.gradient(loop.command, loop.step)
         error, top = loop.command - loop.q, float(np.quantile(np.abs(v), 0.995))
-        if top < _FEW * quantum(log.q[:, loop.joint]) / loop.step or top == 0:
+        if top < _RESOLVED * quantum(log.q[:, loop.joint]) / loop.step or top == 0:
             continue
         clipped = []
         for start, stop in runs_of(np.abs(v) > 0.5 * top):
@@ -364,34 +350,27 @@ def _saturated(log: Log, loops: Sequence[_Loop]) -> Iterator[tuple[str, Finding]
             if unlike > _UNLIKE:
                 clipped.append((at, float(np.ptp(error[at]))))
         share = sum(len(at) for at, _ in clipped) / len(v)
-        if len(clipped) >= _PULSES and share >= _OFTEN:
-            evidence = {"speed": top, "share": share, "error": max(x for _, x in clipped)}
-            yield (
-                loop.name,
-                finding(
-                    "saturated",
-                    log.name,
-                    loop.name,
-                    unit=loop.unit,
-                    movements=len(clipped),
-                    **evidence,
-                ),
-            )
+        if len(clipped) >= _PULSES and share >= SHARE_OF_ROWS:
+            saturated = finding(
+                "saturated", log.name, loop.name, unit=loop.unit, movements=len(clipped),
+                speed=top, share=share, error=max(x for _, x in clipped),
+            )  # fmt: skip
+            yield loop.name, saturated
 
 
 def _sampled(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     """Yield the joints whose log rate is too low for the bandwidth of their loops."""
-    found = {}
+    widths = {}
     for loop in loops:
         f = loop.response[0]
         width = loop.bandwidth if np.isfinite(loop.bandwidth) else float(f[-1]) if len(f) else 0.0
-        if width * loop.step * _RATE > 1:
-            found[loop.name] = width
-    if found:
-        rate, width = 1 / loops[0].step, max(found.values())
+        if width * loop.step * _RESOLVED > 1:
+            widths[loop.name] = width
+    if widths:
+        rate, width = 1 / loops[0].step, max(widths.values())
         yield finding(
-            "slow_sampling", log.name, _named(log, list(found)), joint=listed(found), rate=rate,
-            bandwidth=width, rows=rate / width, wanted=_RATE * width,
+            "slow_sampling", log.name, _named(log, list(widths)), joint=listed(widths), rate=rate,
+            bandwidth=width, rows=rate / width, wanted=_RESOLVED * width,
         )  # fmt: skip
 
 

@@ -1,28 +1,155 @@
-"""Checks of how well the model explains each torque, as stated and under other hypotheses."""
+"""Checks of how well the model explains each torque, as stated and under other hypotheses.
+
+They use the motion of a log at a few hundred instants, with separate parts of the model's torque.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import combinations
 
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.diagnosis.logs.torque_sample import Probe
+from robotid.data.log import Log, Trajectory
+from robotid.data.signal_settings import SignalSettings
+from robotid.data.signals import process, resolve, unwrap
+from robotid.diagnosis.decisions import TINY
+from robotid.diagnosis.logs.channels import AT_REST, ZERO
+from robotid.dynamics.drive_columns import drive_values, friction_directions, friction_speeds
+from robotid.dynamics.torque import carried_columns
+from robotid.robot.model import RobotModel
 
 #: Decrease of the misfit from which another gravity is reported.
 HINT = 0.7
 #: An unexplained share below this is negligible.
 FLOOR = 1e-3
+_MARGIN = 0.15  # [s] rows closer to the end of a segment are not used: the filter has not settled
+_SLOW = 0.05  # largest speed of the unknown sign of friction of a slow joint, over its largest
 _POOR = 0.08  # unexplained share from which other readings of the positions are tested
 _CLEARLY = 2.0  # decrease of the misfit, a factor 7, beyond the readings with stated positions
 _ROWS, _QUARTER = 200, 4  # rows of these tests, and the divisor of their number in a first pass
 _OFFSETS = (0.4, -0.4, np.pi / 2, -np.pi / 2, np.pi)  # [rad] errors of a zero position
 _EARTH = 9.81  # [m/s^2]
-_RINGING = 0.05  # of its largest value, undershoot below 0 by the filter
 _ITERATIONS = 8  # of signs and fit
 _FOLDED = 0.4  # largest ratio of unexplained shares at which a torque is an absolute value
-_CONSTANT = 1e-9  # relative variation of a torque that is rounding
+
+
+@dataclass(frozen=True, eq=False)
+class Probe:
+    """The parts of the model's torque at N instants, linear in masses and gravity.
+
+    Each part is computed at first use. Whole regressors are too large: 0.3 MB per instant for 60
+    joints.
+    """
+
+    model: RobotModel
+    motion: Trajectory  # The smooth motion that contains the instants
+    rows: Array  # (N,), the instants as rows of the motion
+    q: Array  # (N, n), joint positions [rad or m]
+    v: Array  # (N, n), velocities
+    a: Array  # (N, n), accelerations
+    tau: Array  # (N, n), torques [N m or N]
+
+    @classmethod
+    def of(cls, model: RobotModel, motion: Trajectory, rows: Array) -> "Probe":
+        """Return the probe at rows of a motion."""
+        at = (x[rows] for x in (motion.q, motion.v, motion.a, motion.tau))
+        return cls(model, motion, rows, *at)
+
+    @property
+    def gravity(self) -> Array:
+        """Gravity of the model, shape (3,) [m/s^2]."""
+        return np.array(self.model.pin_model.gravity.linear)
+
+    @cached_property
+    def _places(self) -> tuple[Array, Array]:
+        """Rows and bodies of the carried columns, one entry for ten columns."""
+        rows, bodies = np.nonzero(self.model.support[:, : self.model.layout.n_inertial : 10])
+        return rows, bodies
+
+    @cached_property
+    def _ten(self) -> Array:
+        """Columns of the ten parameters of each carried body, shape (N, bodies carried, 10)."""
+        columns = carried_columns(self.model, self.q, self.v, self.a)
+        return columns.reshape(len(columns), -1, 10)
+
+    def _by_link(self, ten: Array) -> Array:
+        pi = self.model.standard_parameters()[: self.model.layout.n_inertial].reshape(-1, 10)
+        rows, bodies = self._places
+        loads = np.zeros((*self.v.shape, len(pi)))
+        loads[:, rows, bodies] = np.einsum("kbi,bi->kb", ten, pi[bodies])
+        return loads
+
+    @cached_property
+    def links(self) -> Array:
+        """The torque of each link on each joint by the URDF, shape (N, n, bodies)."""
+        return self._by_link(self._ten)
+
+    @cached_property
+    def gravity_loads(self) -> Array:
+        """Torques of links at rest, per m/s^2 of gravity in x, y, z, (3, N, n, bodies)."""
+        rest = np.zeros_like(self.v)
+        models = [self.model.with_gravity(axis) for axis in np.eye(3)]
+        columns = (carried_columns(model, self.q, rest, rest) for model in models)
+        return np.array([self._by_link(x.reshape(len(x), -1, 10)) for x in columns])
+
+    @cached_property
+    def last_body(self) -> Array:
+        """Columns of mass and first moments of the last body, shape (N, n, 4)."""
+        rows, bodies = self._places
+        is_last = bodies == self.model.layout.n_inertial // 10 - 1
+        last = np.zeros((*self.v.shape, 4))
+        last[:, rows[is_last]] = self._ten[:, is_last, :4]
+        return last
+
+    def loads(self, gravity: Array | None = None) -> Array:
+        """Return the torque of each link, also with another gravity, shape (N, n, bodies)."""
+        if gravity is None:
+            return self.links
+        more = np.tensordot(gravity - self.gravity, self.gravity_loads, axes=1)
+        return np.asarray(self.links + more)
+
+    @cached_property
+    def drives(self) -> Array:
+        """Columns of the drives: a, v, sign v, 1, -1, and of coupled drives, (N, n, 5 + k)."""
+        v, one = self.v, np.ones_like(self.v)
+        least = AT_REST * self.model.layout.drive_speeds[: v.shape[1]]
+        still = np.minimum(least, _SLOW * np.abs(v).max(axis=0))
+        own = [self.a, v, np.tanh(v / np.where(still > 0, still, least)), one, -one]
+        coupled = coupled_columns(self.model, self.q, v, self.a)
+        return np.concatenate([np.stack(own, axis=2), coupled], axis=2)
+
+
+def coupled_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
+    """Return the regressor's columns of coupled drives, shape (N, n, k)."""
+    layout, coupled = model.layout, np.flatnonzero(model.layout.is_coupled)
+    if not len(coupled):
+        return np.empty((*v.shape, 0))
+    values = drive_values(layout, q, v, a, friction_directions(layout, v, None))
+    return np.asarray(layout.drive_loads[:, coupled] * values[coupled].T[:, None])
+
+
+def smooth_motion(model: RobotModel, log: Log, settings: SignalSettings) -> Trajectory:
+    """Return the motion of a log with velocities and accelerations derived from its positions."""
+    log = unwrap(log, np.array([joint.turns_freely for joint in model.limits]))
+    settings = replace(settings, velocity="differentiated", acceleration="differentiated")
+    return process(log, resolve(log, settings), friction_speeds(model.layout))
+
+
+def take_probe(model: RobotModel, motion: Trajectory, *, samples: int = 500) -> Probe | None:
+    """Return a probe of a motion, None if the motion is too small for any check."""
+    inner = np.ones(len(motion.t), dtype=bool)  # far from the ends of the segment
+    for number in np.unique(motion.segment):
+        part = motion.segment == number
+        t = motion.t[part]
+        inner[part] = (t >= t[0] + _MARGIN) & (t <= t[-1] - _MARGIN)
+    slow = AT_REST * model.layout.drive_speeds[: len(model.joints)]
+    rows = np.flatnonzero((np.abs(motion.v) > slow).any(axis=1) & inner)
+    if len(rows) < 50:
+        return None
+    chosen = np.unique(np.linspace(0, len(rows) - 1, samples).astype(int))
+    return Probe.of(model, motion, rows[chosen])
 
 
 @dataclass(frozen=True)
@@ -32,7 +159,7 @@ class Explanation:
     #: "stated", "payload", "torque_sign", "unsigned_torque", "torque_order", "gravity",
     #: "joint_order", "joint_axis", "position_order", "position_sign" or "position_offset"
     kind: str
-    share: Array  # Unexplained share of each torque's variance, shape (n,)
+    share: Array  # (n,), unexplained share of each torque's variance
     joints: tuple[int, ...] = ()  # Indices of the joints concerned
     #: "torque_order": the joint of each torque column; "gravity": the vector [m/s^2];
     #: "position_offset": the offset [rad]
@@ -52,29 +179,20 @@ def compensated(probe: Probe) -> tuple[Probe, Array]:
     return whole, _over(own_share(whole) * size, logged)
 
 
-def unexplained(probe: Probe) -> Array:
-    """Return the share of each torque column that the model of each joint does not explain."""
-    N, n = probe.tau.shape
-    every = np.hstack([probe.tau, -probe.tau])
-    share = _shares(probe, np.broadcast_to(every, (n, N, 2 * n)))
-    return share.reshape(n, 2, n).transpose(2, 0, 1)
-
-
 def explanations(probe: Probe) -> tuple[Explanation, Explanation, list[Explanation]]:
     """Return how well the torques are explained as stated, and under each other hypothesis."""
-    share = unexplained(probe)
+    N, n = probe.tau.shape
+    every = np.broadcast_to(np.hstack([probe.tau, -probe.tau]), (n, N, 2 * n))
+    share = _shares(probe, every).reshape(n, 2, n).transpose(2, 0, 1)  # (column, joint, sign)
     own = np.diagonal(share).T  # (n, 2)
     stated = Explanation("stated", own[:, 0])
-    others = [_signs(own), _unsigned(probe, own), _order(share), _gravity(probe, stated)]
+    negated = tuple(np.flatnonzero(own[:, 1] < own[:, 0]).tolist())
+    signs = Explanation("torque_sign", own.min(axis=1), negated)
+    others = [signs, _unsigned(probe, own), _order(share), _gravity(probe, stated)]
     loaded = Explanation("payload", np.minimum(own_share(probe, any_load=True), stated.share))
     if stated.share.max() > _POOR:
         others += _positions(probe, min(e.misfit for e in [stated, *others]))
     return stated, loaded, others
-
-
-def _signs(own: Array) -> Explanation:
-    reversed_ = np.flatnonzero(own[:, 1] < own[:, 0])
-    return Explanation("torque_sign", own.min(axis=1), tuple(reversed_.tolist()))
 
 
 def _unsigned(probe: Probe, own: Array) -> Explanation:
@@ -89,7 +207,7 @@ def _unsigned(probe: Probe, own: Array) -> Explanation:
     share, joints = own[:, 0].copy(), []
     loads = probe.loads()
     for j, tau in enumerate(probe.tau.T):
-        if tau.min() < -_RINGING * tau.max() or share[j] < _POOR:
+        if tau.min() < -ZERO * tau.max() or share[j] < _POOR:
             continue
         X = np.hstack([loads[:, j], probe.drives[:, j]])
         starts = (loads[:, j].sum(axis=1), probe.v[:, j], probe.a[:, j])
@@ -102,8 +220,12 @@ def _unsigned(probe: Probe, own: Array) -> Explanation:
 
 def _folded_misfit(X: Array, tau: Array, sign: Array) -> tuple[float, float]:
     """Return the unexplained shares of a torque whose signs are iterated from initial ones."""
+    from scipy.optimize import nnls
+
+    size = np.linalg.norm(X, axis=0)
+    columns = X / np.where(size > 0, size, 1.0)
     for _ in range(_ITERATIONS):
-        sign = np.where(_nonnegative_prediction(X, sign * tau) < 0, -1.0, 1.0)
+        sign = np.where(columns @ nnls(columns, sign * tau)[0] < 0, -1.0, 1.0)
     signed = sign * tau
     left = float(_misfits(X[None], signed[None, :, None])[0, 0])
     of_size, of_signed = (float(np.sum((x - x.mean()) ** 2)) for x in (tau, signed))
@@ -116,8 +238,8 @@ def _order(share: Array) -> Explanation:
 
     columns, joints = linear_sum_assignment(np.log(share[:, :, 0] + FLOOR))
     moved = tuple(np.flatnonzero(columns != joints).tolist())
-    found = share[columns, joints, 0]
-    return Explanation("torque_order", found, moved, tuple(joints.astype(float).tolist()))
+    values = tuple(joints.astype(float).tolist())
+    return Explanation("torque_order", share[columns, joints, 0], moved, values)
 
 
 def _gravity(probe: Probe, stated: Explanation) -> Explanation:
@@ -156,8 +278,10 @@ def _gravity(probe: Probe, stated: Explanation) -> Explanation:
 
     simplex = [[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]]
     options = {"initial_simplex": simplex, "xatol": 5e-3, "fatol": 1e-2, "maxfev": 60}
-    found = minimize(lambda x: tilted(x).misfit, np.zeros(2), method="Nelder-Mead", options=options)
-    return tilted(found.x)
+    best_x = minimize(
+        lambda x: tilted(x).misfit, np.zeros(2), method="Nelder-Mead", options=options
+    ).x
+    return tilted(best_x)
 
 
 def _shares_by_gravity(probe: Probe) -> tuple[Callable[[Array], Array], Array]:
@@ -167,7 +291,7 @@ def _shares_by_gravity(probe: Probe) -> tuple[Callable[[Array], Array], Array]:
     the shares that all their columns leave, with factors of any sign, (n,): no gravity leaves less.
     """
     links, size = probe.loads(), _variation(probe.tau)
-    X = [links, *probe.parts.gravity_loads, probe.drives, probe.tau[:, :, None]]
+    X = [links, *probe.gravity_loads, probe.drives, probe.tau[:, :, None]]
     R = _triangles(np.concatenate(X, axis=2).swapaxes(0, 1))
     bodies = links.shape[2]
     parts = R[:, :, : 4 * bodies].reshape(*R.shape[:2], 4, bodies)
@@ -189,7 +313,9 @@ def _positions(probe: Probe, best: float) -> Iterator[Explanation]:
     required decrease there is not tested further.
     """
     every = max(1, len(probe.rows) // _ROWS)
-    some, few = (probe.at(probe.rows[::k]) for k in (every, _QUARTER * every))
+    some, few = (
+        Probe.of(probe.model, probe.motion, probe.rows[::k]) for k in (every, _QUARTER * every)
+    )
     joints = range(len(probe.model.joints))
     enough, likely = best - _CLEARLY, best - 0.5 * _CLEARLY
     readings: list[Callable[[Probe], list[Explanation]]] = [
@@ -204,8 +330,8 @@ def _positions(probe: Probe, best: float) -> Iterator[Explanation]:
     if first is not None and _refined(few, first).misfit < likely:
         near = [e for e in offsets if e.misfit < first.misfit + 0.5 * _CLEARLY]
         tried = [_offset(some, e.joints[0], e.values[0]) for e in near]
-        found = _refined(some, min(tried, key=lambda e: e.misfit))
-        yield from [found] if found.misfit < enough else []
+        refined = _refined(some, min(tried, key=lambda e: e.misfit))
+        yield from [refined] if refined.misfit < enough else []
 
 
 def _revolute(probe: Probe) -> list[int]:
@@ -221,7 +347,7 @@ def _exchanged(probe: Probe, pair: tuple[int, int]) -> list[Explanation]:
     """
     order = np.arange(len(probe.model.joints))
     order[list(pair)] = pair[::-1]
-    moved = probe.with_motion((probe.q[:, order], probe.v[:, order], probe.a[:, order]))
+    moved = replace(probe, q=probe.q[:, order], v=probe.v[:, order], a=probe.a[:, order])
     share = _shares(moved, np.stack([probe.tau.T, probe.tau.T[order]], axis=2))
     return [
         Explanation("position_order", share[:, 0], pair),
@@ -231,8 +357,7 @@ def _exchanged(probe: Probe, pair: tuple[int, int]) -> list[Explanation]:
 
 def _reversed(probe: Probe, j: int) -> list[Explanation]:
     """Return the readings that the position of a joint is reversed, and its torque as well."""
-    other = probe.with_motion(_moved(probe, j, -1.0, 0.0))
-    share = _shares(other, np.stack([probe.tau.T, -probe.tau.T], axis=2))
+    share = _shares(_moved(probe, j, -1.0, 0.0), np.stack([probe.tau.T, -probe.tau.T], axis=2))
     is_j = np.arange(len(share)) == j
     axis = Explanation("joint_axis", np.where(is_j, share[:, 1], share[:, 0]), (j,))
     sign = Explanation("position_sign", share[:, 0], (j,))
@@ -240,7 +365,7 @@ def _reversed(probe: Probe, j: int) -> list[Explanation]:
 
 
 def _offset(probe: Probe, j: int, offset: float) -> Explanation:
-    share = own_share(probe.with_motion(_moved(probe, j, 1.0, -offset)))
+    share = own_share(_moved(probe, j, 1.0, -offset))
     return Explanation("position_offset", share, (j,), (offset,))
 
 
@@ -249,20 +374,20 @@ def _refined(probe: Probe, rough: Explanation) -> Explanation:
     from scipy.optimize import minimize_scalar
 
     j, centre = rough.joints[0], rough.values[0]
-    found = minimize_scalar(
+    best = minimize_scalar(
         lambda offset: _offset(probe, j, float(offset)).misfit,
         bounds=(centre - 0.4, centre + 0.4), method="bounded",
         options={"xatol": 5e-3, "maxiter": 15},
     )  # fmt: skip
-    return min(rough, _offset(probe, j, float(found.x)), key=lambda e: e.misfit)
+    return min(rough, _offset(probe, j, float(best.x)), key=lambda e: e.misfit)
 
 
-def _moved(probe: Probe, j: int, sign: float, offset: float) -> tuple[Array, Array, Array]:
-    q, v, a = probe.q.copy(), probe.v.copy(), probe.a.copy()
-    q[:, j] = sign * q[:, j] + offset
-    v[:, j] *= sign
-    a[:, j] *= sign
-    return q, v, a
+def _moved(probe: Probe, j: int, sign: float, offset: float) -> Probe:
+    """Return the probe with another position of a joint and the same torques."""
+    only = np.arange(len(probe.model.joints)) == j
+    signs = np.where(only, sign, 1.0)
+    q, v, a = (signs * x for x in (probe.q, probe.v, probe.a))
+    return replace(probe, q=q + offset * only, v=v, a=a)
 
 
 def own_share(probe: Probe, gravity: Array | None = None, any_load: bool = False) -> Array:
@@ -291,7 +416,7 @@ def _over(left: Array, size: Array) -> Array:
 def _variation(tau: Array) -> Array:
     """Return the sum of squares of torques (N, ...) about their mean, 0 if constant."""
     centred = tau - tau.mean(axis=0)
-    is_constant = np.ptp(tau, axis=0) <= _CONSTANT * np.abs(tau).max(axis=0)
+    is_constant = np.ptp(tau, axis=0) <= TINY * np.abs(tau).max(axis=0)
     return np.where(is_constant, 0.0, np.sum(centred**2, axis=0))
 
 
@@ -310,13 +435,3 @@ def _misfits(X: Array, torques: Array) -> Array:
 def _triangles(rows: Array) -> Array:
     """Return the triangular factors of the rows of each joint, (n, N, c), shape (n, c, c)."""
     return np.asarray(np.linalg.qr(rows, mode="r"))
-
-
-def _nonnegative_prediction(X: Array, tau: Array) -> Array:
-    """Return the prediction of a torque by columns with factors >= 0, shape (N,)."""
-    from scipy.optimize import nnls
-
-    size = np.linalg.norm(X, axis=0)
-    columns = X / np.where(size > 0, size, 1.0)
-    predicted: Array = columns @ nnls(columns, tau)[0]
-    return predicted

@@ -1,31 +1,59 @@
-"""Checks of the torques against the model: signs, order of columns, gravity, positions."""
+"""Checks of the torques against the model: signs, columns, gravity, positions, masses and loads."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+import scipy.special
 
-from robotid.base.findings import Finding
+from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
+from robotid.data.log import Trajectory
+from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.logs.hypotheses import HINT, Explanation, explanations
-from robotid.diagnosis.logs.loads import (
-    check_loads,
-    counterbalance,
-    holds_gravity,
+from robotid.diagnosis.decisions import BEYOND_NOISE, ROWS, SIGNIFICANT, TINY
+from robotid.diagnosis.logs.channels import STATIC
+from robotid.diagnosis.logs.hypotheses import (
+    FLOOR,
+    HINT,
+    Explanation,
+    Probe,
+    compensated,
+    explanations,
+    own_share,
 )
-from robotid.diagnosis.logs.torque_sample import Probe
+from robotid.dynamics.base_parameters import BaseMapping
+from robotid.dynamics.factors import Reduction, compress_segments
+from robotid.dynamics.rows import keep_inertial_rows
+from robotid.dynamics.used_rows import base_problem, row_mask
+from robotid.estimation.estimators.two_runs import payload_runs
+from robotid.robot.model import RobotModel
+from robotid.robot.prior import payload_spread, prior_spread
 
-_CERTAIN = 2.5  # significant decrease of the logarithm of the unexplained share, a factor 12
-_EXPLAINED = 0.2  # largest unexplained share of a reading that is accepted
+_MUCH_BETTER = 12.0  # ratio of unexplained shares from which another reading is certain ...
+_CERTAIN = float(np.log(_MUCH_BETTER))  # ... as a decrease of the misfit
+_UNEXPLAINED = 0.25  # unexplained share of a torque's variance that is reported, not accepted
 _WRONG = 0.5  # largest unexplained share of a torque with the right sign
-_EXCUSED = 0.3  # ... and the largest with a load, at which the sign may still be right
-_MUCH_BETTER = 12.0  # ratio of unexplained shares from which the other sign is right nevertheless
-_NOISE = 3e-3  # share of a torque's variance that is negligible
 _TILT = 5.0  # [deg] angle of gravity from the stated one that is a warning
 _WRONG_TILT = 30.0  # [deg] ... and an error
-_STILL = 1e-3  # [rad, m] range of a joint at rest, as of the finding "static_joint"
-_UNEXPLAINED = 0.25  # unexplained share of a torque's variance that is reported
+_SPREAD = 0.3  # prior standard deviation of a link's mass, relative to the URDF's
+_PRECISION = 0.05  # of a torque, model errors included
+_INDEPENDENT = 20.0  # number of independent instants of a log
+_PER_SECOND = 3.0  # ... per second of a short one
+_MASS, _MOMENT = 20.0, 10.0  # [kg], [kg m] prior standard deviations of a payload
+_WORSE = 0.25  # allowed increase of a torque's misfit over its own fit, in variances
+_OTHER_SCALE = 3.0  # a torque scale farther from 1 is no error of masses
+_OTHER_UNIT = 30.0  # ... and a common scale of all torques farther from 1 is another unit, no gain
+_SCALES = np.logspace(-3, 3, 61)
+_ALIKE = _SCALES[2] / _SCALES[0]  # ratio below which two factors on this grid are equal
+_LARGE = 0.08  # payload over the arm's mass that errors of the links do not explain
+_FOLLOWED = 0.5  # ratio of unexplained shares with and without gravity, if a torque contains it
+_MISMATCH = 7.5  # largest sum of squared errors of the links, in standard deviations
+_NOTHING = 0.01  # of the arm's mass, the smallest change of load
+_CLEARLY = 1.5  # least ratio of the misfit of other torque scales to that of a load
+_SEGMENT = 0.4  # [s] longer than the correlation of noise
+_SEGMENTS = 24
 
 
 @dataclass(frozen=True)
@@ -43,19 +71,12 @@ class _Reading:
 
     @property
     def is_certain(self) -> bool:
-        return self.gain > _CERTAIN and float(np.median(self.best.share)) < _EXPLAINED
+        is_explained = float(np.median(self.best.share)) < _UNEXPLAINED
+        return is_explained and self.gain > _CERTAIN
 
     @property
     def joints(self) -> list[str]:
         return [self.probe.model.joints[j] for j in self.best.joints]
-
-    def finding(self, joints: Sequence[str], **values: float | str) -> Finding:
-        """Return the error that columns contain other quantities than stated."""
-        return finding(
-            self.best.kind, self.log, joints, gain=self.gain,
-            unexplained=self.stated.share.max(), unexplained_so_read=self.best.share.max(),
-            **values,
-        )  # fmt: skip
 
 
 def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
@@ -64,28 +85,26 @@ def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
     Only the reading that explains the torques best is reported; if it is the stated one, the
     URDF's masses are checked.
     """
-    probe, balanced = counterbalance(probe, name)
-    yield from balanced
     stated, loaded, others = explanations(probe)
     best = min(others, key=lambda e: e.misfit)
     if best.kind not in ("torque_sign", "unsigned_torque") and loaded.misfit < best.misfit:
         best = stated  # a load explains the torques better
     make = _FINDINGS.get(best.kind)
-    found = list(make(_Reading(probe, stated, best, name))) if make else []
-    for one in found:
+    findings = list(make(_Reading(probe, stated, best, name))) if make else []
+    for one in findings:
         # a fault that a load on the last link explains as well is only a warning
         yield replace(one, severity="warning") if _is_excused(best, loaded) else one
-    if not found:
-        yield from check_loads(probe, loaded.share, name)
+    if not findings:
+        yield from _check_loads(probe, loaded.share, name)
         # the friction of a joint at rest has any value: nothing contradicts its torque
-        still = np.ptp(probe.motion.q, axis=0) < _STILL
+        still = np.ptp(probe.motion.q, axis=0) < STATIC
         yield from _unexplained(probe, np.where(still, 0.0, loaded.share), name)
 
 
 def _sign(reading: _Reading) -> Iterator[Finding]:
     for j, joint in zip(reading.best.joints, reading.joints, strict=True):
         before, after = reading.stated.share[j], reading.best.share[j]
-        if before >= _WRONG and after <= _EXPLAINED:
+        if before >= _WRONG and after <= _UNEXPLAINED:
             evidence = {"unexplained": before, "unexplained_if_negated": after}
             yield finding("torque_sign", reading.log, joint, **evidence)
 
@@ -93,40 +112,39 @@ def _sign(reading: _Reading) -> Iterator[Finding]:
 def _unsigned(reading: _Reading) -> Iterator[Finding]:
     for j, joint in zip(reading.best.joints, reading.joints, strict=True):
         before, after = reading.stated.share[j], reading.best.share[j]
-        if after <= _EXPLAINED:
+        if after <= _UNEXPLAINED:
             yield finding(
                 "unsigned_torque", reading.log, joint, kind="one", cure="one", unexplained=before,
                 unexplained_with_signs=after,
             )  # fmt: skip
 
 
-def _exchanged(reading: _Reading) -> Iterator[Finding]:
+def _moved(reading: _Reading) -> Iterator[Finding]:
+    """Yield the error that columns contain other quantities than stated."""
     if not reading.is_certain:
         return
-    names, best, owners = reading.joints, reading.best, ""
+    before, best, joints = reading.stated.share, reading.best, reading.probe.model.joints
+    words: dict[str, float | str] = {}
     if best.kind == "torque_order":
-        joints = [reading.probe.model.joints[int(best.values[j])] for j in best.joints]
-        pairs = zip(names, joints, strict=True)
-        owners = ", ".join(f"tau_{a} is the torque of {b}" for a, b in pairs)
-    yield reading.finding(names, owners=owners)
-
-
-def _position(reading: _Reading) -> Iterator[Finding]:
-    if reading.is_certain:
-        before, best = reading.stated.share, reading.best
+        pairs = [(joints[j], joints[int(best.values[j])]) for j in best.joints]
+        words["owners"] = ", ".join(f"tau_{a} is the torque of {b}" for a, b in pairs)
+    elif best.kind not in ("joint_order", "position_order"):
         worst = int(np.argmax(before - best.share))
-        offset = {"offset": best.values[0]} if best.values else {}
-        yield reading.finding(
-            reading.joints, worst=reading.probe.model.joints[worst], before=before[worst],
-            after=best.share[worst], what="log", cure="log", **offset,
-        )  # fmt: skip
+        words = {"worst": joints[worst], "before": before[worst], "after": best.share[worst]}
+        words |= {"what": "log", "cure": "log"} | (
+            {"offset": best.values[0]} if best.values else {}
+        )
+    yield finding(
+        best.kind, reading.log, reading.joints, gain=reading.gain, unexplained=before.max(),
+        unexplained_so_read=best.share.max(), **words,
+    )  # fmt: skip
 
 
 def _gravity(reading: _Reading) -> Iterator[Finding]:
     g, believed, gain = np.array(reading.best.values), reading.probe.gravity, reading.gain
     size = float(np.linalg.norm(believed))
     if not g.any():
-        if size > 0 and reading.is_certain and not holds_gravity(reading.probe):
+        if size > 0 and reading.is_certain and not _holds_gravity(reading.probe):
             yield finding("gravity_compensated", reading.log, gain=gain)
         return
     cosine = float(g @ believed) / (float(np.linalg.norm(g)) * size) if size > 0 else 0.0
@@ -142,23 +160,18 @@ def _gravity(reading: _Reading) -> Iterator[Finding]:
     )  # fmt: skip
 
 
+_MOVED = ("torque_order", "joint_order", "position_order", "joint_axis", "position_sign",
+          "position_offset")  # fmt: skip
 _FINDINGS: dict[str, Callable[[_Reading], Iterator[Finding]]] = {
-    "torque_sign": _sign,
-    "unsigned_torque": _unsigned,
-    "torque_order": _exchanged,
-    "joint_order": _exchanged,
-    "position_order": _exchanged,
-    "joint_axis": _position,
-    "position_sign": _position,
-    "position_offset": _position,
-    "gravity": _gravity,
-}
+    "torque_sign": _sign, "unsigned_torque": _unsigned, "gravity": _gravity,
+    **dict.fromkeys(_MOVED, _moved),
+}  # fmt: skip
 
 
 def _is_excused(best: Explanation, loaded: Explanation) -> bool:
     if best.kind in ("torque_sign", "unsigned_torque"):
         excused = (
-            loaded.share[j] < min(_EXCUSED, _MUCH_BETTER * (best.share[j] + _NOISE))
+            loaded.share[j] < min(_UNEXPLAINED, _MUCH_BETTER * (best.share[j] + FLOOR))
             for j in best.joints
         )
         return all(excused)
@@ -174,3 +187,263 @@ def _unexplained(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
         return
     for j in bad:
         yield finding(code, name, probe.model.joints[j], what="joint", share=share[j])
+
+
+@dataclass(frozen=True, eq=False)
+class LoadModel:
+    """The whitened torques of each joint, projected orthogonally to the columns of its drive.
+
+    The c free parameters are factors of the URDF's links, and m, mcx, mcy, mcz of a payload.
+    """
+
+    R: Array  # (n, c+1, c+1), triangular factors of columns and torque; 0 of joints not used
+    mean: Array  # (c,), prior mean
+    spread: Array  # (c,), prior standard deviation
+    expected: float  # Misfit of torques that fit as well as with separate parameters for each joint
+    independent: float  # Number of independent torques
+
+    def misfits(self, scales: Array) -> Array:
+        """Return the misfits of scaled torques: chi-squares, prior included, shape (T,)."""
+        R = np.asarray(np.linalg.qr(self._rows(scales), mode="r"))  # (T, c+1, c+1)
+        return np.asarray(R[:, -1, -1] ** 2)
+
+    def fit(self, scale: Array) -> tuple[float, Array, Array]:
+        """Fit with the torque columns multiplied by a scale, without negative masses of links."""
+        from scipy.optimize import lsq_linear
+
+        rows = self._rows(scale[None])[0]
+        bounds = np.full(len(self.mean), -np.inf)
+        bounds[:-4] = 0.0
+        solution = lsq_linear(rows[:, :-1], rows[:, -1], bounds=(bounds, np.inf), method="bvls")
+        inverse = np.linalg.inv(np.linalg.qr(rows[:, :-1], mode="r"))
+        error: Array = self.spread * np.linalg.norm(inverse, axis=1)
+        return 2 * float(solution.cost), self.spread * solution.x, error
+
+    def is_this_robot(self, scale: Array) -> bool:
+        """Return whether scaled torques fit well with masses of the links near the URDF's."""
+        chi, theta, _ = self.fit(scale)
+        is_good = chi - self.expected < _WORSE * self.independent
+        return is_good and _error_of_links(theta) < _MISMATCH
+
+    def _rows(self, scales: Array) -> Array:
+        """Return the rows of torques and prior, columns times the spread, (T, N, c+1)."""
+        c, (T, n) = len(self.mean), scales.shape
+        rows = self.R * np.append(self.spread, 1.0)
+        rows = np.repeat(rows[None], T, axis=0)  # (T, n, c+1, c+1)
+        rows[..., :-1] /= scales[:, :, None, None]
+        prior = np.column_stack([np.eye(c), self.mean / self.spread])
+        prior = np.repeat(prior[None], T, axis=0)
+        return np.concatenate([rows.reshape(T, n * (c + 1), c + 1), prior], axis=1)
+
+
+def load_model(probe: Probe, share: Array, level: Array | None = None) -> LoadModel:
+    """Return the load model of a motion: share (n,), level (n,)."""
+    N, n = probe.tau.shape
+    duration = float(np.ptp(probe.motion.t[probe.rows]))
+    independent = min(_INDEPENDENT, _PER_SECOND * duration)
+    links, last = probe.loads(), probe.last_body
+    bodies = links.shape[2]
+    X = np.concatenate([links, last, probe.tau[:, :, None]], axis=2)
+    level = probe.tau.std(axis=0) if level is None else level
+    used = (level > TINY * np.abs(probe.tau).max()) & (share < _UNEXPLAINED)
+    R = np.zeros((n, bodies + 5, bodies + 5))
+    for j in np.flatnonzero(used).tolist():
+        drive = np.delete(probe.drives[:, j], 4, axis=1)
+        length = np.linalg.norm(drive, axis=0)
+        U, s, _ = np.linalg.svd(drive / np.where(length > 0, length, 1.0), full_matrices=False)
+        Q = U[:, s > TINY * s[0]]
+        left = X[:, j] - Q @ (Q.T @ X[:, j])
+        sigma = np.sqrt(_PRECISION**2 + share[j]) * level[j]
+        R[j] = np.linalg.qr(left * np.sqrt(independent / N) / sigma, mode="r")
+    mean = np.append(np.ones(bodies), np.zeros(4))
+    spread = np.append(np.full(bodies, _SPREAD), [_MASS, *[_MOMENT] * 3])
+    expected = independent * float((share / (_PRECISION**2 + share))[used].sum())
+    return LoadModel(R, mean, spread, expected, independent * float(used.sum()))
+
+
+def _check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
+    """Yield torques in another scale, a payload, a URDF of another robot.
+
+    Another scale is accepted if the torques then fit with about the URDF's masses; else the URDF
+    is of another robot.
+    """
+    model, ones = load_model(probe, share), np.ones(len(share))
+    bodies = len(probe.model.layout.bodies)
+    _, theta, error = model.fit(ones)
+    if not model.is_this_robot(ones):
+        scale = _torque_scales(model)
+        other = np.flatnonzero(np.abs(np.log(scale)) > np.log(_OTHER_SCALE))
+        if len(other) and model.is_this_robot(scale):
+            yield from _scaled(probe, scale, _needed(model, scale, other), name)
+            return
+        if _holds_no_gravity(probe):
+            yield finding("gravity_compensated", name)
+            return
+        if len(other) or _error_of_links(theta) > _MISMATCH:
+            factors = dict(zip(probe.model.layout.bodies, theta[:bodies].tolist(), strict=True))
+            words = ", ".join(f"{link} {factor:.2g}" for link, factor in factors.items())
+            yield finding("urdf_mismatch", name, factors=words, **factors)
+            return
+    yield from _payload(probe, theta[bodies:], float(error[bodies]), name)
+
+
+def _holds_no_gravity(probe: Probe) -> bool:
+    """Return whether the torques fit the URDF if its gravity is added, and not as logged.
+
+    Both tests use the level of the logged torques, and no load on the last link.
+    """
+    if not probe.gravity.any() or _holds_gravity(probe):
+        return False
+    readings, ones = [(probe, own_share(probe)), compensated(probe)], np.ones(probe.tau.shape[1])
+    logged, corrected = (
+        load_model(reading, share, probe.tau.std(axis=0)).is_this_robot(ones)
+        for reading, share in readings
+    )
+    return corrected and not logged
+
+
+def _holds_gravity(probe: Probe) -> bool:
+    """Return whether the torque of a joint contains its gravity torque by the URDF."""
+    with_gravity, without = own_share(probe), own_share(probe, np.zeros(3))
+    followed = (with_gravity + FLOOR < _FOLLOWED * (without + FLOOR)) & (without < 1.0)
+    return bool(followed.any())
+
+
+def _error_of_links(theta: Array) -> float:
+    return float(np.sum(((theta[:-4] - 1.0) / _SPREAD) ** 2))
+
+
+def _torque_scales(model: LoadModel) -> Array:
+    """Return the factors of the torque columns that reduce the misfit significantly, else 1."""
+    n = len(model.R)
+    common = np.repeat(_SCALES[:, None], n, axis=1)
+    chi = model.misfits(np.vstack([np.ones(n), common]))
+    best = int(np.argmin(chi[1:]))
+    starts = [np.ones(n)]
+    is_other = abs(np.log(_SCALES[best])) > np.log(_OTHER_SCALE)
+    if is_other and chi[0] - chi[1 + best] > SIGNIFICANT**2:
+        starts.append(common[best])
+    ends = np.array([_descended(model, start) for start in starts])
+    scale = ends[int(np.argmin(model.misfits(ends)))]
+    return np.where(model.R.any(axis=(1, 2)), scale, 1.0)
+
+
+def _descended(model: LoadModel, scale: Array) -> Array:
+    """Return the factors after a coordinate descent from initial ones."""
+    n = len(scale)
+    for _ in range(n):
+        trials = np.repeat(scale[None], n * len(_SCALES), axis=0)
+        trials[np.arange(len(trials)), np.repeat(np.arange(n), len(_SCALES))] = np.tile(_SCALES, n)
+        chi = model.misfits(np.vstack([scale, trials]))
+        if chi[0] - chi[1:].min() < SIGNIFICANT**2:
+            break
+        scale = trials[int(np.argmin(chi[1:]))]
+    return scale
+
+
+def _needed(model: LoadModel, scale: Array, other: Array) -> Array:
+    """Return the joints whose other scale is needed to fit the torques; all if all are scaled."""
+    if len(other) == len(scale):
+        return other
+    smallest = scale.copy()
+    for j in other:
+        without = np.where(np.arange(len(scale)) == j, 1.0, smallest)
+        if model.is_this_robot(without):
+            smallest = without
+    return np.asarray(other[smallest[other] != 1.0])
+
+
+def _scaled(probe: Probe, scale: Array, other: Array, name: str) -> Iterator[Finding]:
+    joints, factors = [probe.model.joints[j] for j in other], scale[other].tolist()
+    code = "current_for_torque"
+    if len(other) > 1 and np.ptp(np.log(factors)) < np.log(_ALIKE):
+        factor = float(np.exp(np.log(factors).mean()))
+        is_all = len(other) == len(scale)
+        is_unit = is_all and abs(np.log(factor)) > np.log(_OTHER_UNIT)
+        yield finding(
+            code, name, () if is_all else joints, severity="error" if is_unit else "warning",
+            factor=factor, joints=len(other), joint=listed(joints),
+        )  # fmt: skip
+        return
+    for joint, factor in zip(joints, factors, strict=True):
+        yield finding(code, name, joint, factor=factor)
+
+
+def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Finding]:
+    mass = float(load[0])
+    arm = float(probe.model.standard_parameters()[: probe.model.layout.n_inertial : 10].sum())
+    if abs(mass) < BEYOND_NOISE * error:
+        return
+    link = probe.model.layout.bodies[-1]
+    yield finding(
+        "payload", name, subject=link, link=link, sense=mass > 0, cure=mass > 0,
+        severity="warning" if abs(mass) - 2 * error > _LARGE * arm else "note",
+        mass=mass, std_error=error, mcx=load[1], mcy=load[2], mcz=load[3],
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """Motions of a robot, and the reduced least-squares problems of their segments."""
+
+    model: RobotModel
+    mapping: BaseMapping  # Standard to base parameters
+    motions: Sequence[Trajectory]
+    min_velocity: float  # Lower bound on the speed of the rows that are used
+
+    @cached_property
+    def reductions(self) -> tuple[Reduction, ...]:
+        """The reduced problem of each segment, in order."""
+        return tuple(part for motion in self.motions for part in self._of(motion))
+
+    def _of(self, motion: Trajectory) -> Iterator[Reduction]:
+        thin = motion.every(max(1, len(motion.t) // ROWS))
+        keep_inertial_rows(self.model, thin)  # used for the excitation, too
+        count = int(np.clip(np.ptp(thin.t) / _SEGMENT, 1, _SEGMENTS))
+        length = -(-len(thin.t) // count)
+        rows = row_mask(self.model, thin, self.min_velocity)
+        problem = base_problem(self.model, self.mapping, thin, rows, compiled=False)
+        for i, factors in enumerate(compress_segments(problem, length)):
+            part = thin.at(slice(i * length, (i + 1) * length))
+            yield Reduction(factors, part.squares, len(part.t))
+
+
+def check_payload_change(
+    fitted: Segments, validation: Segments, signals: SignalSettings, name: str
+) -> Iterator[Finding]:
+    """Yield a warning "payload_change" if a validation log has another load than the fitted ones.
+
+    Both are fitted together, with free parameters of all links and a load in the last link of the
+    validation log only. The load is reported if the same robot with it fits both.
+    """
+    model, mapping, layout = fitted.model, fitted.mapping, fitted.model.layout
+    first, second = fitted.reductions, validation.reductions
+    every = (*first, *second)
+    squares, samples = sum(r.squares for r in every), sum(r.samples for r in every)
+    size = payload_spread(model)
+    last = mapping.K[:, layout.n_inertial - 10 : layout.n_inertial]
+    seconds = sum(float(np.ptp(motion.t)) for x in (fitted, validation) for motion in x.motions)
+    runs = payload_runs(
+        first, second, layout, mapping.K, model.standard_parameters(),
+        prior_spread(model, np.asarray(squares), samples), (last, np.full(10, np.nan), size),
+        share=min(1.0, 2.0 * (signals.cutoff or np.inf) * seconds / samples),
+    )  # fmt: skip
+    theta, covariance = runs.alike()
+    least = SIGNIFICANT * float(np.sqrt(covariance[-10, -10]))
+    if abs(theta[-10]) <= max(least, _NOTHING * size[0]):
+        return  # standard errors with changes over time are not smaller
+    # the load is tested with errors that include changes over time; torque scales are tried below
+    changed = runs.compare(by_joint=False)
+    mass, error = float(changed.theta[-10]), float(np.sqrt(changed.covariance[-10, -10]))
+    p_value = scipy.special.ndtr(-SIGNIFICANT)
+    half_width = -float(scipy.special.stdtrit(changed.freedom[-10], p_value)) * error
+    if not max(half_width, _NOTHING * size[0]) < abs(mass) < size[0]:
+        return
+    left = runs.residual_ratios(changed.theta) - 1.0
+    by_scales = runs.residual_ratios_by_scales(runs.D.shape[1] - 10) - 1.0
+    if _CLEARLY * left.mean() > by_scales.mean():
+        return  # the logs differ by another effect
+    link = layout.bodies[-1]
+    yield finding(
+        "payload_change", name, subject=link, link=link, sense=mass > 0, mass=mass, std_error=error
+    )

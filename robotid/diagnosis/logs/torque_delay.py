@@ -4,7 +4,7 @@ The regressor is computed from a motion with three times the bandwidth. The same
 applied to torque and regressor, because a filter of only one of them looks like a delay.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -16,28 +16,23 @@ from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import low_pass
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.logs.torque_sample import coupled_columns, smooth_motion
+from robotid.diagnosis.decisions import BEYOND_NOISE, ROUNDING, ROWS
+from robotid.diagnosis.logs.channels import AT_REST, MOVING
+from robotid.diagnosis.logs.hypotheses import coupled_columns, smooth_motion
 from robotid.dynamics.torque import carried_columns
 from robotid.robot.model import RobotModel
 
 _LONGEST = 0.1  # [s] largest delay of the grid
-_ROUNDING = 1e-10  # of the longest column: shorter columns are 0 except for rounding
-_DEPENDENT = 1e-5  # of the largest singular value: smaller ones are of dependent columns
 _GRID = np.linspace(-_LONGEST, _LONGEST, 81)
 _NEAR = 0.01  # [s] around the delay, where the misfit is a parabola
 _FINEST = 0.001  # [s] apparent delay by friction that the model does not describe
 _HELD = 0.1  # [samples] ... or by a zero-order hold of the torque
-_SIGNIFICANT = 3.0  # [standard errors] from which a delay is reported
 _DELAYED = 0.04  # [s] a longer delay must explain more: other model errors look like one, too
 _HELPS = 0.15  # least share of the unexplained torque that it must explain
 _FEW = 100  # least number of rows of a joint that is used
-_MOVING = 0.1  # least share of the instants in which it moves
 _SLOW = 0.05  # [rad/s] slower: a drive may be in stiction
-_STILL = 0.02  # [rad/s] width of the change of the direction of friction
 _AWAY = 0.75  # [periods of the filter] closer to a slow instant, friction is unknown
-_ROWS = 2000  # number of instants that are used
-_WINDOWS = 8  # number of segments with these instants in a long log
-_BLOCKS = 8  # number of blocks of the jackknife
+_BLOCKS = 8  # number of segments with these instants in a long log, and of blocks of the jackknife
 _OVERSAMPLED = 8.0  # instants per period of the filter: the regressor has a larger bandwidth
 # Cut-off of the comparison over the job's, and over the rate at most, since interpolation smooths
 # the noise at higher frequencies.
@@ -45,46 +40,36 @@ _BAND = 1.5, 0.15
 _WIDE = 3.0, 0.4  # the same of the motion from which the regressor is computed
 _SETTLED = 1.5  # [periods of the filter] settling time of the filter at an end of a segment
 _HARMONICS = 4  # of a torque that is periodic in the position, as of gears and magnets
-_EXACT = 1e-5  # share of a torque that is noise even in an exact log
+# Share of a torque that is noise even in an exact log, and of the largest singular value that
+# dependent columns leave.
+_EXACT = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class _Misfit:
-    """The unexplained part of each torque at each delay of the grid."""
+    """The unexplained part of each torque at each delay of the grid.
 
-    #: Sums of squares in each block of the log, as shares of the joint's torque, shape (n, blocks,
-    #: delays)
-    squares: Array
-    rows: Array  # Number of instants of each joint, shape (n,)
-    #: The same sums if friction also grows with the load, shape (n, blocks, delays); None: not
-    #: compared
-    loaded: Array | None = None
+    The parts are sums of squares in each block of the log, as shares of the joint's torque.
+    """
+
+    squares: Array  # (n, blocks, delays)
+    loaded: Array  # the same if friction also grows with the load
+    rows: Array  # (n,), number of instants of each joint
 
     def delays_without(self, axis: int) -> list[float]:
         """Return the delays of the jackknife over joints (axis 0) or blocks of the log (1)."""
-        parts = range(self.squares.shape[axis])
-        if axis == 0:
-            return [self.without({k}).delay() for k in parts]
-        return [replace(self, squares=np.delete(self.squares, k, axis=1)).delay() for k in parts]
+        delays = []
+        for k in range(self.squares.shape[axis]):
+            rows = np.delete(self.rows, k) if axis == 0 else self.rows
+            squares = np.delete(self.squares, k, axis=axis)
+            delays.append(replace(self, squares=squares, rows=rows).delay())
+        return delays
 
     @property
-    def is_of_load(self) -> bool:
-        """Whether friction by load, which looks like a delay, explains more than the delay."""
-        return self.loaded is not None and self.gain() < float(self.by_load(0.0).mean())
-
-    def by_load(self, delay: float) -> Array:
-        """Return the share of the unexplained torque that friction by load explains, shape (n,)."""
-        if self.loaded is None:
-            return np.zeros(len(self.squares))
-        now, then = (_at(delay, squares) for squares in (self.squares, self.loaded))
-        share: Array = 1.0 - (then.sum(axis=1) + _EXACT) / (now.sum(axis=1) + _EXACT)
-        return share
-
-    def without(self, left_out: Collection[int]) -> "_Misfit":
-        """Return the misfit of the joints that are not left out."""
-        used = [k for k in range(len(self.rows)) if k not in left_out]
-        loaded = None if self.loaded is None else self.loaded[used]
-        return _Misfit(self.squares[used], self.rows[used], loaded)
+    def by_load(self) -> float:
+        """The share of the unexplained torque that friction by load explains without a delay."""
+        now, then = (_at(0.0, x).sum(axis=1) for x in (self.squares, self.loaded))
+        return float((1.0 - (then + _EXACT) / (now + _EXACT)).mean())
 
     def delay(self) -> float:
         """Return the delay with the smallest misfit [s], NaN if it is at an end of the grid."""
@@ -100,10 +85,8 @@ class _Misfit:
 
     def error(self) -> float:
         """Return the standard error of the delay [s]: jackknife over joints and over blocks."""
-        variance = 0.0
-        for delays in (self.delays_without(0), self.delays_without(1)):
-            variance += (len(delays) - 1) * float(np.var(delays))
-        return float(np.sqrt(variance))
+        jackknife = (self.delays_without(axis) for axis in (0, 1))
+        return float(np.sqrt(sum((len(x) - 1) * float(np.var(x)) for x in jackknife)))
 
     def gain(self) -> float:
         """Return the share of the unexplained torque that the delay of other blocks explains."""
@@ -117,20 +100,18 @@ def _at(delay: float, values: Array) -> Array:
     """Return values on the grid, shape (..., delays), at a delay of it, linear in between."""
     k = min(max(int(np.searchsorted(_GRID, delay)), 1), len(_GRID) - 1)
     share = (delay - _GRID[k - 1]) / (_GRID[k] - _GRID[k - 1])
-    found: Array = values[..., k - 1] + share * (values[..., k] - values[..., k - 1])
-    return found
+    return np.asarray(values[..., k - 1] + share * (values[..., k] - values[..., k - 1]))
 
 
 @dataclass(frozen=True, eq=False)
 class _Window:
     """Filtered torques of contiguous rows of a motion, and the columns that may explain them."""
 
-    inertial: Array  # Of the bodies that each joint carries, joint after joint, shape (N, columns)
-    #: Of each joint's inertia, frictions and position, and of coupled drives, (N, n, k)
-    drive: Array
-    steady: Array  # Whether the drive is far from stiction, shape (N, n), bool
-    delayed: Array  # Torques at each delay of the grid after the instants, shape (n, delays, N)
-    load: Array  # Friction that grows with the URDF's torque, per unit of its coefficient, (N, n)
+    inertial: Array  # (N, columns), of the bodies that each joint carries, joint after joint
+    drive: Array  # (N, n, k), of each joint's inertia, frictions and position, of coupled drives
+    steady: Array  # (N, n), whether the drive is far from stiction
+    delayed: Array  # (n, delays, N), torques at each delay of the grid after the instants
+    load: Array  # (N, n), friction that grows with the URDF's torque, for a coefficient of 1
 
 
 def check_torque_delay(
@@ -154,22 +135,16 @@ def check_torque_delay(
     wide = replace(signals, cutoff=signals.cutoff and min(times * signals.cutoff, most * rate))
     motion = smooth_motion(model, log, wide)
     misfit = _misfit(model, motion, replace(signals, cutoff=cutoff), 1 / cutoff)
-    if misfit is not None and len(misfit.rows) > 1:
-        yield from _common(misfit, step, signals, name)
-
-
-def _common(misfit: _Misfit, step: float, signals: SignalSettings, name: str) -> Iterator[Finding]:
-    """Yield the common delay of all torques, if it is determined."""
+    if misfit is None:
+        return
     delay, error, gain = misfit.delay(), misfit.error(), misfit.gain()
     if not np.isfinite([delay, error, gain]).all():
         return
     error = float(np.hypot(error, max(_FINEST, _HELD * step)))
-    is_significant = abs(delay) > _SIGNIFICANT * error and gain > (
-        _HELPS if abs(delay) > _DELAYED else 0.0
-    )
+    least = _HELPS if abs(delay) > _DELAYED else 0.0
     todo = "none"
-    if is_significant:
-        todo = "of_load" if misfit.is_of_load else "clear" if gain > _HELPS else "filter"
+    if abs(delay) > BEYOND_NOISE * error and gain > least:
+        todo = "of_load" if gain < misfit.by_load else "clear" if gain > _HELPS else "filter"
     yield finding(
         "torque_delay", name, severity="note" if todo in ("none", "of_load") else "warning",
         todo=todo, sense=delay > 0, delay=delay, std_error=error, gain=gain,
@@ -187,25 +162,25 @@ def _misfit(
         _window(model, motion, part, step, every, signals, period)
         for part in _segments(model, motion, every)
     ]
-    ends = np.cumsum(model.support()[:, : model.layout.n_inertial].sum(axis=1)).tolist()
-    own = [slice(*pair) for pair in pairwise([0, *ends])]
-    found = [_squares(windows, j, part) for j, part in enumerate(own)] if windows else []
-    used = {j: one for j, one in enumerate(found) if one is not None}
-    if len(used) < max(2.0, len(own) / 2):
+    ends = np.cumsum(model.support[:, : model.layout.n_inertial].sum(axis=1)).tolist()
+    columns = [slice(*pair) for pair in pairwise([0, *ends])]
+    squares = [_squares(windows, j, own) for j, own in enumerate(columns)] if windows else []
+    used = [one for one in squares if one is not None]
+    if len(used) < max(2.0, len(columns) / 2):
         return None
-    squares, loaded, rows = zip(*used.values(), strict=True)
-    return _Misfit(np.array(squares), np.array(rows, dtype=float), np.array(loaded))
+    plain, loaded, rows = zip(*used, strict=True)
+    return _Misfit(np.array(plain), np.array(loaded), np.array(rows, dtype=float))
 
 
 def _segments(model: RobotModel, motion: Trajectory, every: int) -> list[Array]:
     """Return contiguous rows, of one segment each, spread over the motion."""
-    moving = np.flatnonzero((np.abs(motion.v) > _STILL * _units(model)).any(axis=1))
+    moving = np.flatnonzero((np.abs(motion.v) > AT_REST * _units(model)).any(axis=1))
     if len(moving) == 0:
         return []
     first, stop = int(moving[0]), int(moving[-1]) + 1
-    length = _ROWS * every // _WINDOWS
-    if stop - first > _WINDOWS * length:
-        starts = np.linspace(first, stop - length, _WINDOWS).astype(int)
+    length = ROWS * every // _BLOCKS
+    if stop - first > _BLOCKS * length:
+        starts = np.linspace(first, stop - length, _BLOCKS).astype(int)
         chosen = [np.arange(start, start + length) for start in starts]
     else:
         chosen = [np.arange(first, stop)]
@@ -215,8 +190,7 @@ def _segments(model: RobotModel, motion: Trajectory, every: int) -> list[Array]:
 
 def _units(model: RobotModel) -> Array:
     """Return the speed of each joint that counts as 1 rad/s, shape (n,)."""
-    speeds: Array = model.layout.drive_speeds[: len(model.joints)]
-    return speeds
+    return np.asarray(model.layout.drive_speeds[: len(model.joints)])
 
 
 def _window(
@@ -229,8 +203,8 @@ def _window(
     inner = (motion.t[coarse] >= t[0] + edge) & (motion.t[coarse] <= t[-1] - edge)
     # friction as an antisymmetric function of the speed and torques periodic in the position, so
     # that they do not look like a delay; filtered before decimation, because friction jumps
-    top = np.maximum(np.abs(motion.v).max(axis=0) / _units(model), _STILL)
-    signs = [np.tanh(v / speed) for speed in (_STILL, 0.1 * top, 0.3 * top)]
+    top = np.maximum(np.abs(motion.v).max(axis=0) / _units(model), AT_REST)
+    signs = [np.tanh(v / speed) for speed in (AT_REST, 0.1 * top, 0.3 * top)]
     waves = [wave(k * q) for k in range(1, 1 + _HARMONICS) for wave in (np.cos, np.sin)]
     own = np.stack([motion.a[rows], v, *signs, v * np.abs(v), *waves], axis=2)
     own = low_pass(own, 1 / step, signals)[::every][inner]
@@ -254,11 +228,10 @@ def _window(
 def _of_urdf(model: RobotModel, carried: Array) -> Array:
     """Return the torque of the URDF's bodies from ``carried_columns``, shape (N, n)."""
     size = model.layout.n_inertial
-    support, pi = model.support()[:, :size], model.standard_parameters()[:size]
+    support, pi = model.support[:, :size], model.standard_parameters()[:size]
     ends = np.cumsum(support.sum(axis=1))
     weighted = np.cumsum(carried * np.concatenate([pi[row] for row in support]), axis=1)
-    torque: Array = np.diff(weighted[:, ends - 1], axis=1, prepend=0.0)
-    return torque
+    return np.asarray(np.diff(weighted[:, ends - 1], axis=1, prepend=0.0))
 
 
 def _interpolated(t: Array, values: Array, times: Array) -> Array:
@@ -267,16 +240,14 @@ def _interpolated(t: Array, values: Array, times: Array) -> Array:
         return np.empty((*times.shape, values.shape[1]))
     from scipy.interpolate import CubicSpline  # takes long to import
 
-    at: Array = CubicSpline(t, values)(times)
-    return at
+    return np.asarray(CubicSpline(t, values)(times))
 
 
 def _distance(at: Array, slow: Array) -> Array:
     """Return the distance of each time from the nearest slow instant, shape as at [s]."""
     bounds = np.concatenate([[-np.inf], slow, [np.inf]])
     after = np.searchsorted(bounds, at)
-    distance: Array = np.minimum(at - bounds[after - 1], bounds[after] - at)
-    return distance
+    return np.asarray(np.minimum(at - bounds[after - 1], bounds[after] - at))
 
 
 def _squares(windows: Sequence[_Window], j: int, own: slice) -> tuple[Array, Array, int] | None:
@@ -287,7 +258,7 @@ def _squares(windows: Sequence[_Window], j: int, own: slice) -> tuple[Array, Arr
     """
     steady = [window.steady[:, j] for window in windows]
     used = sum(map(np.count_nonzero, steady))
-    if used < max(_FEW, _MOVING * sum(map(len, steady))):
+    if used < max(_FEW, MOVING * sum(map(len, steady))):
         return None
     pairs = list(zip(windows, steady, strict=True))
     inertial = np.concatenate([window.inertial[at, own] for window, at in pairs])
@@ -303,7 +274,7 @@ def _squares(windows: Sequence[_Window], j: int, own: slice) -> tuple[Array, Arr
     blocks = np.array_split(tau, _BLOCKS, axis=1)
     plain = np.array([np.einsum("dk,dk->d", b, b) for b in blocks]) / size
     rest = load - Q @ (Q.T @ load)
-    if rest @ rest > _DEPENDENT**2 * load @ load:
+    if rest @ rest > _EXACT**2 * load @ load:
         tau -= np.outer(tau @ rest, rest / (rest @ rest))
     return plain, np.array([np.einsum("dk,dk->d", b, b) for b in blocks]) / size, used
 
@@ -311,9 +282,8 @@ def _squares(windows: Sequence[_Window], j: int, own: slice) -> tuple[Array, Arr
 def _orthonormal(X: Array) -> Array:
     """Return an orthonormal basis of columns, (N, k), without those that are dependent."""
     length = np.linalg.norm(X, axis=0)
-    is_excited = length > _ROUNDING * length.max()  # other columns are 0 except for rounding
+    is_excited = length > ROUNDING * length.max()  # other columns are 0 except for rounding
     X = X[:, is_excited] / length[is_excited]
     squares, V = np.linalg.eigh(X.T @ X)
-    independent = squares > _DEPENDENT**2 * squares[-1]
-    basis: Array = X @ (V[:, independent] / np.sqrt(squares[independent]))
-    return basis
+    independent = squares > _EXACT**2 * squares[-1]
+    return np.asarray(X @ (V[:, independent] / np.sqrt(squares[independent])))

@@ -10,8 +10,8 @@ standard error. It is refitted with one segment of the recordings held out after
 (``misfit``).
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -19,19 +19,9 @@ import numpy as np
 from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
+from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.residual.decisions import (
-    ALTERATION,
-    ALTERATION_P_VALUE,
-    ALTERATION_SHARE,
-    CONFIRMED,
-    SIGNIFICANT,
-    WEAK,
-    WEAK_P_VALUE,
-    WEAK_SIZE,
-    Round,
-    select,
-)
+from robotid.diagnosis.decisions import Round, select
 from robotid.diagnosis.residual.misfit import Misfit, find_misfits
 from robotid.diagnosis.residual.term_trials import Sample, Trials, along
 from robotid.dynamics.prediction import body_slopes, drive_torque, inverse_dynamics
@@ -50,11 +40,28 @@ class _Alteration:
 
     code: str
     joints: tuple[str, ...]  # none: all of them
-    Z: Array  # torques of sizes of 1, shape (N, n, c)
+    Z: Array  # (N, n, c), torques of sizes of 1
     least: float  # smallest size that changes a result
-    #: the values of the finding, for sizes (c,)
-    values: Callable[[Array], dict[str, float | str]]
+    words: Mapping[str, str] = field(default_factory=dict)  # of its finding
     applied: _Applied | None = None  # robot and motions with sizes (c,), if torques are nonlinear
+
+    def values(self, x: Array) -> dict[str, float | str]:
+        """Return the values of the finding for sizes (c,)."""
+        of_residual = {"what": "residual", "cure": "residual"}
+        if self.code == "position_offset":
+            return {"correction": -x[0], **of_residual, **self.words}
+        if self.code == "gravity" and self.applied is not None:
+            g = self.applied(x)[0].pin_model.gravity.linear
+            return {"best": ", ".join(f"{value:.2f}" for value in g), **of_residual}
+        if self.code in ("joint_origin", "lost_motion"):
+            return {**self.words}
+        values: dict[str, float | str] = {"factor": 1 + x[0], **self.words}
+        if self.code == "time_scale":
+            values["speed"] = np.sqrt(max(1 + x[0], 0.0))
+        if self.code == "torque_scale":
+            sense = "one" if len(self.joints) == 1 else "more" if x[0] > 0 else "less"
+            values |= {"what": sense, "cure": sense}
+        return values
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +70,7 @@ class _Found:
 
     alteration: _Alteration
     finding: Finding
-    there: Sample
+    corrected: Sample
 
 
 def explain_residual(
@@ -78,18 +85,18 @@ def explain_residual(
     if sample is None or model.free_flyer or model.constraints or model.passive:
         return (), ()
     misfits = find_misfits(sample)
-    own = list(_alterations(model, fit.standard, sample))
-    found = list(_found(fit, sample, own))
+    possible = list(_alterations(model, fit.standard, sample))
+    found = list(_found(fit, sample, possible))
     if misfits and found:
         altered = np.concatenate([one.alteration.Z for one in found], axis=2)
         lacking = _columns(misfits, sample)
         if _left(sample, altered) < _left(sample, lacking):
             alone = {(misfit.joint, misfit.term.code) for misfit in misfits}
-            remaining = find_misfits(found[0].there.with_columns(altered))
+            remaining = find_misfits(found[0].corrected.with_columns(altered))
             misfits = tuple(m for m in remaining if (m.joint, m.term.code) in alone)
         else:
             among = {one.alteration for one in found}
-            retested = _found(fit, sample.with_columns(lacking), own)
+            retested = _found(fit, sample.with_columns(lacking), possible)
             found = [one for one in retested if one.alteration in among]
     return misfits, tuple(one.finding for one in found)
 
@@ -158,42 +165,39 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
 
     for j, joint in enumerate(model.joints):
         only, one = np.eye(n)[j], (joint,)
-        unit = "m" if joint in model.layout.prismatic else "rad"
-        Z, zero = moved(np.zeros(n), only), partial(_zero, unit=unit)
-        yield _Alteration("position_offset", one, Z, 0.01, zero, partial(offset, j))
+        unit = {"unit": "m" if joint in model.layout.prismatic else "rad"}
+        Z = moved(np.zeros(n), only)
+        yield _Alteration("position_offset", one, Z, 0.01, unit, partial(offset, j))
         backlash = 0.5 * Z * sample.motions[j].direction[:, None, None]
-        yield _Alteration("lost_motion", one, backlash, 0.005, partial(_named, unit=unit))
-        scaled = partial(_factor, subject=f"q_{joint}")
-        yield _Alteration("angle_scale", one, moved(only, np.zeros(n)), 0.02, scaled)
+        yield _Alteration("lost_motion", one, backlash, 0.005, unit)
+        scaled = moved(only, np.zeros(n))
+        yield _Alteration("angle_scale", one, scaled, 0.02, {"named": f"q_{joint}"})
         if sample.torque[j]:  # a torque of 0 has no scale
-            yield _Alteration("torque_scale", one, (tau * only)[..., None], 0.05, _gain)
+            yield _Alteration("torque_scale", one, (tau * only)[..., None], 0.05)
     for first in range(1, n - 1):  # the drives of a wrist are of the same type
         Z = (tau * (np.arange(n) >= first))[..., None]
-        yield _Alteration("torque_scale", model.joints[first:], Z, 0.05, _gains)
-    every = partial(_factor, subject="every position")
+        yield _Alteration("torque_scale", model.joints[first:], Z, 0.05)
+    every = {"named": "every position"}
     yield _Alteration("angle_scale", (), moved(np.ones(n), np.zeros(n)), 0.02, every)
     bodies = np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
     still = [replace(m, v=0.0 * m.v, a=0.0 * m.a) for m in sample.at]
     inertial = tau - of_drives - _torques(model, bodies, still)
-    yield _Alteration("time_scale", (), inertial[..., None], 0.04, _clock)
+    yield _Alteration("time_scale", (), inertial[..., None], 0.04)
     down = np.array(model.pin_model.gravity.linear)
     if down.any():
-        across = np.linalg.svd(down[None])[2][1:]  # two directions perpendicular to gravity
+        size, across = np.linalg.norm(down), np.linalg.svd(down[None])[2][1:]
 
         def tilted(x: Array) -> tuple[RobotModel, Sequence[Trajectory]]:
-            return model.with_gravity(_tilted(x, across, down)), sample.at
+            """Return the robot with gravity rotated by angles with tangents x (2,)."""
+            g = down + size * x @ across  # towards two directions perpendicular to gravity
+            return model.with_gravity(g * size / np.linalg.norm(g)), sample.at
 
-        def tilt(x: Array) -> dict[str, float | str]:
-            best = ", ".join(f"{value:.2f}" for value in _tilted(x, across, down))
-            return {"best": best, "what": "residual", "cure": "residual"}
-
-        Z = by_gravity @ (np.linalg.norm(down) * across).T
-        yield _Alteration("gravity", (), Z, 0.05, tilt, tilted)
+        Z = by_gravity @ (size * across).T
+        yield _Alteration("gravity", (), Z, 0.05, applied=tilted)
     for j, joint in enumerate(model.joints):
-        named = partial(_named, subject=joint)
-        yield _Alteration("joint_origin", (joint,), by_origin[:, :, j], 0.01, named)
+        yield _Alteration("joint_origin", (joint,), by_origin[:, :, j], 0.01, {"named": joint})
     anywhere = by_origin.reshape(len(tau), n, -1)
-    yield _Alteration("joint_origin", (), anywhere, 0.01, partial(_named, subject="a joint"))
+    yield _Alteration("joint_origin", (), anywhere, 0.01, {"named": "a joint"})
 
 
 def _torques(model: RobotModel, pi: Array, at: Sequence[Trajectory]) -> Array:
@@ -206,96 +210,60 @@ def _drives(model: RobotModel, pi: Array, at: Sequence[Trajectory]) -> Array:
     return np.concatenate([drive_torque(model, pi, motion) for motion in at])
 
 
-def _tilted(x: Array, across: Array, down: Array) -> Array:
-    """Return gravity rotated towards two perpendicular axes, by tangents x of angles (2,)."""
-    size = np.linalg.norm(down)
-    tilted = down + size * x @ across
-    return np.asarray(tilted * size / np.linalg.norm(tilted))
-
-
-def _found(fit: Fit, sample: Sample, own: Sequence[_Alteration]) -> Iterator[_Found]:
+def _found(fit: Fit, sample: Sample, possible: Sequence[_Alteration]) -> Iterator[_Found]:
     """Yield the alterations that explain the residual, each together with those found before."""
-    Z = np.concatenate([alteration.Z for alteration in own], axis=2)
-    ends = np.cumsum([alteration.Z.shape[2] for alteration in own]).tolist()
-    place = [list(range(end - a.Z.shape[2], end)) for a, end in zip(own, ends, strict=True)]
+    Z = np.concatenate([alteration.Z for alteration in possible], axis=2)
+    ends = np.cumsum([alteration.Z.shape[2] for alteration in possible]).tolist()
+    untried = {
+        a: list(range(end - a.Z.shape[2], end)) for a, end in zip(possible, ends, strict=True)
+    }
     trials = Trials(sample, Z)
     held_out, whole = trials.held_out, trials.whole
     chosen: list[int] = []
     total = before = held_out.left([])
     of_fitted, of_validation = (float(part.sum()) for part in np.split(total, [sample.fitted]))
-    untried = dict(zip(own, place, strict=True))
 
     def offered() -> Round[_Alteration]:
         left = held_out.left_each({one: [*chosen, *which] for one, which in untried.items()})
         return Round(before, left, sample.fitted, of_fitted)
 
-    for this, best in select(offered, ALTERATION, _complexity):
+    def complexity(one: _Alteration) -> tuple[int, int]:
+        return one.Z.shape[2], len(one.joints)  # number of sizes, and of joints named
+
+    for this, best in select(offered, decisions.ALTERATION, complexity):
         if best is None:
             return
         gain = float((before - this.left[best])[sample.fitted :].sum())
-        confirmed = gain / max(of_validation, 1e-300)
+        confirmed = gain / max(of_validation, decisions.NOTHING)
         share, by_p_value = this.share(best), this.p_value(best)
-        has_validation, is_weak = len(total) > sample.fitted, share < ALTERATION_SHARE
-        is_confirmed = not has_validation or confirmed > CONFIRMED * share
+        has_validation, is_weak = len(total) > sample.fitted, share < decisions.LEAST_SHARE
+        is_confirmed = not has_validation or confirmed > decisions.CONFIRMED * share
         if is_weak:
-            is_confirmed = has_validation and confirmed > share > WEAK and by_p_value < WEAK_P_VALUE
-        if by_p_value > ALTERATION_P_VALUE or not is_confirmed:
+            is_confirmed = (
+                has_validation
+                and confirmed > share > decisions.WEAK
+                and by_p_value < decisions.WEAK_P_VALUE
+            )
+        if by_p_value > decisions.P_VALUE or not is_confirmed:
             return
         which = untried.pop(best)
         chosen, before = [*chosen, *which], this.left[best]
         sizes, covariance = whole.estimate(chosen, sample.fitted)
         size, error = (x[-len(which) :] for x in (sizes, np.sqrt(np.diag(covariance))))
-        least = best.least * (WEAK_SIZE if is_weak else 1.0)
-        if np.linalg.norm(size) < max(least, SIGNIFICANT * float(np.linalg.norm(error))):
+        least = best.least * (decisions.WEAK_SIZE if is_weak else 1.0)
+        if np.linalg.norm(size) < max(least, decisions.SIGNIFICANT * float(np.linalg.norm(error))):
             return
-        there = sample
+        corrected = sample
         if best.applied is not None and len(chosen) == len(which):
-            size, error, there = _refined(best.applied, size, fit.standard, sample)
-        others = [one for one in this.alike(ALTERATION) if one is not best]
-        yield _Found(best, _finding(best, size, error, share, others), there)
-
-
-def _complexity(one: _Alteration) -> tuple[int, int]:
-    """Return the number of sizes of an alteration, and the number of joints it names."""
-    return one.Z.shape[2], len(one.joints)
-
-
-def _finding(
-    found: _Alteration, size: Array, error: Array, share: float, alike: Sequence[_Alteration]
-) -> Finding:
-    others = [f"{one.code} of {', '.join(one.joints)}" for one in alike if one.joints]
-    tangents = np.degrees(np.arctan([np.linalg.norm(size), np.linalg.norm(error)]))
-    values = found.values(size)
-    values = {"named" if key == "subject" else key: value for key, value in values.items()}
-    return finding(
-        found.code, "", found.joints, subject="" if found.joints else "all joints",
-        severity="warning", explained=True, also=bool(others), others=listed(others),
-        size=float(size[0] if len(size) == 1 else np.linalg.norm(size)), share_pct=100 * share,
-        std_error=float(np.linalg.norm(error)), angle=tangents[0], angle_error=tangents[1],
-        **values,
-    )  # fmt: skip
-
-
-def _zero(x: Array, unit: str) -> dict[str, float | str]:
-    return {"correction": -x[0], "unit": unit, "what": "residual", "cure": "residual"}
-
-
-def _named(x: Array, **words: str) -> dict[str, float | str]:
-    return {**words}
-
-
-def _factor(x: Array, subject: str) -> dict[str, float | str]:
-    return {"factor": 1 + x[0], "subject": subject}
-
-
-def _gain(x: Array) -> dict[str, float | str]:
-    return {"factor": 1 + x[0], "what": "one", "cure": "one"}
-
-
-def _gains(x: Array) -> dict[str, float | str]:
-    sense = "more" if x[0] > 0 else "less"
-    return {"factor": 1 + x[0], "what": sense, "cure": sense}
-
-
-def _clock(x: Array) -> dict[str, float | str]:
-    return {"factor": 1 + x[0], "speed": np.sqrt(max(1 + x[0], 0.0))}
+            size, error, corrected = _refined(best.applied, size, fit.standard, sample)
+        others = [one for one in this.alike(decisions.ALTERATION) if one is not best and one.joints]
+        alike = listed(f"{one.code} of {', '.join(one.joints)}" for one in others)
+        norm, norm_error = float(np.linalg.norm(size)), float(np.linalg.norm(error))
+        angle, angle_error = np.degrees(np.arctan([norm, norm_error]))
+        explained = finding(
+            best.code, "", best.joints, subject="" if best.joints else "all joints",
+            severity="warning", explained=True, also=bool(others), others=alike,
+            size=float(size[0] if len(size) == 1 else norm), share_pct=100 * share,
+            std_error=norm_error, angle=angle, angle_error=angle_error, **best.values(size),
+        )  # fmt: skip
+        yield _Found(best, explained, corrected)

@@ -14,8 +14,9 @@ Where constraint forces were eliminated, the torque of a drive appears in the ro
 too. The families of each joint are then selected again together with those of the others.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -23,19 +24,9 @@ import numpy as np
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
-from robotid.diagnosis.residual.decisions import (
-    AT_BOUND,
-    FAMILY,
-    FAMILY_LEAST,
-    GROWN,
-    ROUNDING,
-    STEP,
-    TENFOLD,
-    UNDECIDED_P_VALUE,
-    Round,
-    select,
-)
-from robotid.diagnosis.residual.term_trials import RIDGE, Sample, Trial, Trials, take_sample
+from robotid.diagnosis import decisions
+from robotid.diagnosis.decisions import Round, select
+from robotid.diagnosis.residual.term_trials import Sample, Trial, Trials, take_sample
 from robotid.dynamics.prediction import drive_motion_along
 from robotid.estimation.fitting.drive_terms import DriveChoice, FoundShape, Tried, with_shapes
 from robotid.estimation.fitting.fitted import Solution
@@ -44,12 +35,10 @@ from robotid.robot.drives import FAMILIES
 
 _GRID = 6  # values of a shape tested between its bounds
 _SPAN = 100.0  # largest over smallest of them; an upper bound beyond is also tested
-_SLOWEST = 0.0  # share of samples slower than the data range
 _REVOLUTION = 2 * np.pi  # [rad]
 _STEPS = 40  # iterations of the search for all shapes of a joint together
-_SHARPEST = 1e-6  # of the squared residual: lower limit for weights, for exact data
-_NOTHING = 1e-300
 _LOADED = ("load", "lag")  # families that depend on the torque of the drive
+_Sized = tuple[Family, list[float]]  # a family and its shapes
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,59 +66,34 @@ class _Drive:
 
 
 def choose_drives(
-    fit: Solution,
-    wanted: Mapping[str, Sequence[str] | None],
-    balanced: Mapping[str, str] | None = None,
+    fit: Solution, wanted: Mapping[str, Sequence[str] | None]
 ) -> tuple[DriveChoice, ...]:
     """Return the terms of each joint's drive."""
     sample = take_sample(fit, for_drives=True, is_free=True)
     if sample is None:
         return ()
-    drives, choices = _drives(fit, sample, wanted), dict[str, DriveChoice]()
-    bound = take_sample(fit, for_drives=True) if balanced else None
+    drives = _drives(fit, sample, wanted)
 
-    def choose(j: int, together: Sample) -> None:
-        joint = sample.joints[j]
-        names, alone, drive = wanted[joint], together.of_joint(j), drives[j]
-        if names is not None:
-            choices[joint] = _fixed(alone, drive, names)
-            return
-        suspected = [FAMILIES[balanced[joint]]] if balanced and joint in balanced else []
-        first = list(_candidates(drive, suspected))
-        if bound is not None and first:
-            own = bound.of_joint(j)
-            grown = _grown(_reweighted(own, drive, first), drive, first)
-            first = first if max(grown.values(), default=1.0) < GROWN else []
-        choices[joint] = _auto(alone, drive, suspected, first)
+    def choose(j: int, together: Sample) -> DriveChoice:
+        names, alone = wanted[sample.joints[j]], together.of_joint(j)
+        return _auto(alone, drives[j]) if names is None else _fixed(alone, drives[j], names)
 
-    for j in drives:
-        choose(j, sample)
-    if sample.basis is not None:
-        _choose_together(sample, drives, choices, choose)
-    return tuple(choices.values())
-
-
-def _choose_together(
-    sample: Sample,
-    drives: Mapping[int, _Drive],
-    choices: Mapping[str, DriveChoice],
-    choose: Callable[[int, Sample], None],
-) -> None:
-    """Select the terms of each joint again, together with those of all others."""
-    chosen = {j: choices[sample.joints[j]].terms for j in drives}
-    chosen = {j: terms for j, terms in chosen.items() if terms}
-    if len(chosen) < 2:
-        return
+    choices = {j: choose(j, sample) for j in drives}
+    chosen = {j: choice.terms for j, choice in choices.items() if choice.terms}
+    if sample.basis is None or len(chosen) < 2:
+        return tuple(choices.values())
+    # where constraint forces were eliminated: again, together with the terms of all others
     first, size = sample.W.shape[1] - len(sample.joints), sample.W.shape[2]
     owner = np.repeat(list(chosen), [len(terms) for terms in chosen.values()])
     Z = np.zeros((*sample.r.shape, len(owner)))
     for j, terms in chosen.items():
         Z[:, first + j, owner == j] = drives[j].columns(terms)
-    together = sample.with_columns(Z)
+    extended = sample.with_columns(Z)
     for j in chosen:
-        others = [k for k in chosen if k != j and choices[sample.joints[k]].terms]
+        others = [k for k in chosen if k != j and choices[k].terms]
         which = np.append(np.arange(size), size + np.flatnonzero(np.isin(owner, others)))
-        choose(j, together.with_some_columns(which))
+        choices[j] = choose(j, extended.with_some_columns(which))
+    return tuple(choices.values())
 
 
 def _drives(
@@ -151,31 +115,22 @@ def _drives(
         if not used[:, j].any() or (names is not None and not names) or joint in fit.model.passive:
             continue
         own = tuple(motion.of(j) for motion in motions)
-        data_range = _range_of(own, sample.taken, used[:, j])
         plain = {
             name: sample.U[:, k]
             for k, name in enumerate(fit.mapping.base_names)
             if name.startswith(f"{joint}.")
         }
+        taken = [(m.q[rows], m.v[rows]) for m, rows in zip(own, sample.taken, strict=True)]
+        q, v = (np.concatenate(x)[used[:, j]] for x in zip(*taken, strict=True))
+        ends = {key: (float(x.min()), float(x.max())) for key, x in (("q", q), ("v", np.abs(v)))}
         drives[j] = _Drive(
-            bool(sample.is_prismatic[j]), is_free, own, sample.taken, data_range,
+            bool(sample.is_prismatic[j]), is_free, own, sample.taken, ends,
             float(np.abs(largest[:, j]).max()), plain,
         )  # fmt: skip
     return drives
 
 
-def _range_of(motions: Sequence[DriveMotion], taken: Sequence[Array], used: Array) -> DataRange:
-    """Return the ranges of position and of absolute velocity in the used samples."""
-    own = [(m.q[rows], m.v[rows]) for m, rows in zip(motions, taken, strict=True)]
-    q, v = (np.concatenate(x)[used] for x in zip(*own, strict=True))
-    speed = np.abs(v)
-    return {
-        "q": (float(q.min()), float(q.max())),
-        "v": (float(np.quantile(speed, _SLOWEST)), float(speed.max())),
-    }
-
-
-def _candidates(drive: _Drive, families: Sequence[Family]) -> Iterator[tuple[Family, list[float]]]:
+def _candidates(drive: _Drive, families: Sequence[Family]) -> Iterator[_Sized]:
     """Yield families with every shape on its grid."""
     for family in families:
         revolutions = (drive.data_range["q"][1] - drive.data_range["q"][0]) / _REVOLUTION
@@ -184,50 +139,61 @@ def _candidates(drive: _Drive, families: Sequence[Family]) -> Iterator[tuple[Fam
             continue
         if not all(0.0 < low < high for low, high in bounds):  # it hardly moved
             continue
-        grids = [_sizes(*pair) for pair in bounds]
-        terms = family.make(drive.data_range, *[float(sizes[0]) for sizes in grids])
+        terms = family.make(drive.data_range, *[low for low, _ in bounds])
         if not drive.has_load and any(term.needs_load for term in terms):
             continue
+        grids = [_sizes(low, high) for low, high in bounds]
         yield from ((family, [float(x) for x in sizes]) for sizes in product(*grids))
 
 
 def _sizes(low: float, high: float) -> Array:
     """Return the tested values of a shape."""
-    own = np.geomspace(low, min(high, _SPAN * low), _GRID)
-    return own if own[-1] >= high else np.append(own, high)
+    grid = np.geomspace(low, min(high, _SPAN * low), _GRID)
+    return grid if grid[-1] >= high else np.append(grid, high)
 
 
 @dataclass(frozen=True, eq=False)
 class _Options:
     """Candidates of a joint, with every shape on the grid, and their residuals."""
 
-    own: list[tuple[Family, list[float]]]
+    own: list[_Sized]
     place: list[list[int]]  # columns of each
     is_positive: Array  # columns whose parameter cannot be negative, bool
     highest: Array  # upper bounds of their parameters
     trials: Trials
 
     @classmethod
-    def of(cls, sample: Sample, drive: _Drive, own: list[tuple[Family, list[float]]]) -> "_Options":
+    def of(cls, sample: Sample, drive: _Drive, own: list[_Sized]) -> "_Options":
         terms = [family.make(drive.data_range, *sizes) for family, sizes in own]
         ends = np.cumsum([len(those) for those in terms]).tolist()
         place = [list(range(e - len(those), e)) for those, e in zip(terms, ends, strict=True)]
         flat = [term for those in terms for term in those]
         positive = np.array([term.is_nonnegative for term in flat], dtype=bool)
         highest = np.array([min(x.highest, drive.largest / _amplitude(drive, x)) for x in flat])
-        return cls(own, place, positive, highest, _trials(sample, drive, flat))
+        trials = Trials(sample, drive.columns(flat)[:, None])
+        return cls(own, place, positive, highest, trials)
+
+    def name(self, i: int) -> str:
+        """Return the family of a candidate."""
+        return self.own[i][0].name
+
+    def simplicity(self, i: int) -> tuple[int, int]:
+        """Return the columns of a candidate, and the place of its family in their order."""
+        return len(self.place[i]), list(FAMILIES).index(self.name(i))
 
     def left(self, chosen: Sequence[int]) -> Array:
         """Return the squared residual of each segment with some candidates."""
         return self.trials.held_out.left(self._columns(chosen))
 
-    def left_each(self, retained: Mapping[int, Sequence[int]]) -> dict[int, Array]:
-        """Return the squared residual of each segment with each candidate and some others.
+    def left_each(self, chosen: Sequence[int]) -> dict[int, Array]:
+        """Return the squared residual of each segment with those chosen and each other candidate.
 
         Only of candidates with physical parameters: friction opposes motion and is below the
-        largest torque of the joint.
+        largest torque of the joint. A joint has one family of each kind.
         """
-        columns = {i: self._columns([*others, i]) for i, others in retained.items()}
+        kinds = {_kind(self.name(k)) for k in chosen}
+        other = [i for i in range(len(self.own)) if _kind(self.name(i)) not in kinds]
+        columns = {i: self._columns([*chosen, i]) for i in other}
         theta = self.trials.whole.parameters_each(columns)
         possible = {
             i: which
@@ -241,11 +207,9 @@ class _Options:
         return [k for i in chosen for k in self.place[i]]
 
 
-def _trials(
-    sample: Sample, drive: _Drive, terms: Sequence[DriveTerm], ridge: float = RIDGE
-) -> Trials:
-    """Return the trials of terms of a drive."""
-    return Trials(sample, drive.columns(terms)[:, None], ridge)
+def _kind(name: str) -> str:
+    """Return the kind of a family: its name without a number."""
+    return name.rstrip("0123456789")
 
 
 def _amplitude(drive: _Drive, term: DriveTerm) -> float:
@@ -254,82 +218,42 @@ def _amplitude(drive: _Drive, term: DriveTerm) -> float:
     At low speed the filter reduces the sign of the velocity and hides the amplitude of the curve.
     """
     if term.guards != "v" or not isinstance(term, MemorylessTerm):
-        return _NOTHING
+        return decisions.NOTHING
     v = np.linspace(*drive.data_range["v"], 50)
-    return float(np.abs(term.amplitude(np.zeros_like(v), v)).max()) + _NOTHING
+    return float(np.abs(term.amplitude(np.zeros_like(v), v)).max()) + decisions.NOTHING
 
 
-def _auto(
-    sample: Sample,
-    drive: _Drive,
-    suspected: Sequence[Family] = (),
-    known: Sequence[tuple[Family, list[float]]] = (),
-) -> DriveChoice:
-    """Return the fewest families that held-out segments require together with known ones."""
-    automatic = [f for f in FAMILIES.values() if f.is_automatic]
-    grid = list(_candidates(drive, [*automatic, *suspected]))
-    start = _reweighted(sample, drive, known)
-    every = _Options.of(start, drive, [*known, *grid])
-    torque = float(start.torque[0])
-    chosen = list(range(len(known)))
-    undecided: list[tuple[Family, list[float]]] = []
+def _auto(sample: Sample, drive: _Drive) -> DriveChoice:
+    """Return the fewest families that held-out segments require."""
+    grid = list(_candidates(drive, [f for f in FAMILIES.values() if f.is_automatic]))
+    every, torque = _Options.of(sample, drive, grid), float(sample.torque[0])
+    chosen: list[int] = []
+    undecided: list[_Sized] = []
     before = every.left(chosen)
-    retained: dict[int, list[int]] = {}
-    names = tuple(family.name for family, _ in known)
-    tried = [Tried(names, _percent(before, torque), 1.0, True)]
+    tried = [Tried((), _percent(before, torque), 1.0, True)]
 
     def offered() -> Round[int]:
-        nonlocal retained
-        retained = _retained(every, chosen, len(known))
-        left = every.left_each(retained)
-        whole = float(before.sum())
-        return Round(before, left, len(before), whole, FAMILY_LEAST**2 * torque)
+        left, total = every.left_each(chosen), float(before.sum())
+        return Round(before, left, len(before), total, decisions.FAMILY_LEAST**2 * torque)
 
     def cost(i: int) -> tuple[int, int]:
-        return _simplicity(every, i)
+        return every.simplicity(i)
 
-    for this, best in select(offered, FAMILY, cost):
-        found = None
-        if best is not None:
-            found = _conditioned(sample, drive, every, this, retained, best)
-            best = found.number
-        tried += list(_considered(every, this, torque, retained, best))
-        if found is None or best is None:
+    for this, best in select(offered, decisions.FAMILY, cost):
+        refined = None if best is None else _conditioned(sample, drive, every, this, chosen, best)
+        best = None if refined is None else refined.number
+        tried += _considered(every, this, torque, chosen, best)
+        if refined is None:
             nearest = min(this.left, key=lambda i: float(this.left[i].sum()), default=None)
-            if nearest is not None and this.p_value(nearest) < UNDECIDED_P_VALUE:
+            if nearest is not None and this.p_value(nearest) < decisions.UNDECIDED_P_VALUE:
                 undecided = [every.own[nearest]]
             break
-        own = found.own
-        known = known if set(chosen) <= set(retained[best]) else ()
-        weighted = found.weighted
-        every, torque = _Options.of(weighted, drive, [*own, *grid]), float(weighted.torque[0])
-        chosen = list(range(len(own)))
+        every = _Options.of(refined.weighted, drive, [*refined.own, *grid])
+        torque = float(refined.weighted.torque[0])
+        chosen = list(range(len(refined.own)))
         before = every.left(chosen)
     choice = _found(sample, drive, [every.own[i] for i in chosen], tuple(tried))
     return replace(choice, undecided=_terms(drive, undecided))
-
-
-def _retained(every: _Options, chosen: Sequence[int], known: int) -> dict[int, list[int]]:
-    """Return the chosen candidates that remain with each candidate that may be added.
-
-    A joint has one family of each kind. Only families given before the selection are replaced.
-    """
-    groups = [_group(every.own[k][0]) for k in chosen]
-    return {
-        i: [k for k, group in zip(chosen, groups, strict=True) if group != _group(family)]
-        for i, (family, _) in enumerate(every.own)
-        if i not in chosen and _group(family) not in groups[known:]
-    }
-
-
-def _group(family: Family) -> str:
-    """Return the kind of a family; a joint has one family of each kind."""
-    return family.name.rstrip("0123456789")
-
-
-def _simplicity(every: _Options, i: int) -> tuple[int, int]:
-    """Return the number of columns of a candidate, and the place of its family in their order."""
-    return len(every.place[i]), list(FAMILIES).index(every.own[i][0].name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,19 +261,15 @@ class _Refined:
     """A candidate together with those chosen, with shapes refined between the grid's values."""
 
     number: int
-    own: list[tuple[Family, list[float]]]  # those chosen and the candidate
+    own: list[_Sized]  # those chosen and the candidate
     weighted: Sample  # the samples with weights from the residual with these
     faults: tuple[bool, bool]  # a shape is at its bound, a standard error increases tenfold
 
 
 def _conditioned(
-    sample: Sample,
-    drive: _Drive,
-    every: _Options,
-    this: Round[int],
-    retained: Mapping[int, Sequence[int]],
+    sample: Sample, drive: _Drive, every: _Options, this: Round[int], chosen: Sequence[int],
     best: int,
-) -> _Refined:
+) -> _Refined:  # fmt: skip
     """Return the best candidate, or an equally good and better conditioned one of another family.
 
     Equally good: its residual of held-out segments is not larger than that of the best, within the
@@ -358,9 +278,9 @@ def _conditioned(
     """
 
     def refined(i: int) -> _Refined:
-        own = _refined(sample, drive, [every.own[k] for k in (*retained[i], i)])
+        own = _refined(sample, drive, [every.own[k] for k in (*chosen, i)])
         weighted = _reweighted(sample, drive, own)
-        is_grown = max(_grown(weighted, drive, own).values(), default=1.0) > TENFOLD
+        is_grown = max(_grown(weighted, drive, own).values(), default=1.0) > decisions.TENFOLD
         return _Refined(i, own, weighted, (bool(_at_bound(drive, own).any()), is_grown))
 
     def left_of(other: _Refined) -> Array:
@@ -372,13 +292,13 @@ def _conditioned(
     by_family: dict[str, int] = {}
     left, whole = this.left, float(this.before.sum())
     for i in sorted(left, key=lambda i: float(left[i].sum())):
-        by_family.setdefault(every.own[i][0].name, i)
-    by_family.pop(every.own[best][0].name)
+        by_family.setdefault(every.name(i), i)
+    by_family.pop(every.name(best))
     others = [refined(i) for i in by_family.values() if left[i].sum() < whole]
     better = [other for other in others if other.faults < first.faults]
-    least, slack = left_of(first), FAMILY.alike * whole
+    least, slack = left_of(first), decisions.FAMILY.alike * whole
     alike = [other for other in better if _is_alike(least, left_of(other), slack)]
-    return min((first, *alike), key=lambda x: (x.faults, *_simplicity(every, x.number)))
+    return min((first, *alike), key=lambda x: (x.faults, *every.simplicity(x.number)))
 
 
 def _is_alike(best: Array, other: Array, slack: float) -> bool:
@@ -389,28 +309,23 @@ def _is_alike(best: Array, other: Array, slack: float) -> bool:
 
 
 def _considered(
-    every: _Options,
-    this: Round[int],
-    torque: float,
-    retained: Mapping[int, Sequence[int]],
-    best: int | None,
-) -> Iterator[Tried]:
-    """Yield the error that each family would give at its best shape."""
+    every: _Options, this: Round[int], torque: float, chosen: Sequence[int], best: int | None
+) -> list[Tried]:
+    """Return the error that each family would give at its best shape, or as selected."""
     by_family: dict[str, int] = {}
-    left = this.left
-    for i, after in left.items():
-        name = every.own[i][0].name
-        if i == best or (
-            by_family.get(name, i) != best and after.sum() <= left[by_family.get(name, i)].sum()
-        ):
-            by_family[name] = i
-    for name, i in by_family.items():
-        names = [every.own[k][0].name for k in retained[i]]
-        yield Tried((*names, name), _percent(left[i], torque), this.p_value(i), i == best)
+    for i, after in this.left.items():
+        before = by_family.setdefault(every.name(i), i)
+        if i == best or (before != best and after.sum() <= this.left[before].sum()):
+            by_family[every.name(i)] = i
+    names = [every.name(k) for k in chosen]
+    return [
+        Tried((*names, name), _percent(this.left[i], torque), this.p_value(i), i == best)
+        for name, i in by_family.items()
+    ]
 
 
 def _percent(left: Array, torque: float) -> float:
-    return 100.0 * float(np.sqrt(left.sum() / max(torque, _NOTHING)))
+    return 100.0 * float(np.sqrt(left.sum() / max(torque, decisions.NOTHING)))
 
 
 def _fixed(sample: Sample, drive: _Drive, names: Sequence[str]) -> DriveChoice:
@@ -444,68 +359,58 @@ def _fixed(sample: Sample, drive: _Drive, names: Sequence[str]) -> DriveChoice:
 
 
 def _found(
-    sample: Sample,
-    drive: _Drive,
-    chosen: Sequence[tuple[Family, list[float]]],
-    tried: tuple[Tried, ...],
+    sample: Sample, drive: _Drive, chosen: Sequence[_Sized], tried: tuple[Tried, ...]
 ) -> DriveChoice:
     """Return the choice with its shapes refined."""
     refined = _refined(sample, drive, chosen)
-    families = [family for family, _ in refined]
-    flat = _flat(refined)
-    shapes = [(family, shape) for family in families for shape in family.shapes]
-    is_at_bound = _at_bound(drive, refined)
-    weighted = _reweighted(sample, drive, refined)
-    covariance = _shape_covariance(weighted, drive, families, flat)
+    flat, weighted = _flat(refined), _reweighted(sample, drive, refined)
+    covariance = np.empty((0, 0))
+    if len(flat):
+        count, trial = _with_slopes(weighted, drive, refined)
+        _, every = trial.estimate(list(range(count + len(flat))), weighted.fitted)
+        covariance = every[count:, count:]
+    named = [(family.name, shape) for family, _ in refined for shape in family.shapes]
+    errors, is_at_bound = np.sqrt(np.diag(covariance)), _at_bound(drive, refined)
     return DriveChoice(
         joint=sample.joints[0],
-        families=tuple(family.name for family in families),
+        families=tuple(family.name for family, _ in refined),
         terms=_terms(drive, refined),
         tried=tried,
         shapes=tuple(
             FoundShape(
-                name=f"{family.name}.{shape.name}",
-                value=float(value),
-                std_error=float(std_error),
-                unit=shape.units[int(drive.is_prismatic)],
-                is_at_bound=bool(is_edge),
+                f"{name}.{shape.name}", float(flat[k]), float(errors[k]),
+                shape.units[int(drive.is_prismatic)], bool(is_at_bound[k]),
             )
-            for (family, shape), value, std_error, is_edge in zip(
-                shapes, flat, np.sqrt(np.diag(covariance)), is_at_bound, strict=True
-            )
+            for k, (name, shape) in enumerate(named)
         ),
         shape_covariance=tuple(tuple(row) for row in covariance.tolist()),
         sizes=tuple(tuple(own) for _, own in refined),
         data_range=drive.data_range,
         grown=_grown(weighted, drive, refined),
-    )
+    )  # fmt: skip
 
 
-def _flat(chosen: Sequence[tuple[Family, Sequence[float]]]) -> Array:
+def _flat(chosen: Sequence[_Sized]) -> Array:
     """Return all shapes of families in a row, shape (k,)."""
     return np.array([size for _, own in chosen for size in own])
 
 
-def _at_bound(drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]) -> Array:
+def _at_bound(drive: _Drive, chosen: Sequence[_Sized]) -> Array:
     """Return which shapes are at a bound of their search range, shape (k,)."""
-    bounds = _log_bounds(drive, [family for family, _ in chosen])
-    margin = AT_BOUND * np.ptp(bounds, axis=1)
-    is_near: Array = np.min(np.abs(np.log(_flat(chosen))[:, None] - bounds), axis=1) < margin
-    return is_near
+    bounds = _log_bounds(drive, chosen)
+    margin = decisions.AT_BOUND * np.ptp(bounds, axis=1)
+    return np.asarray(np.min(np.abs(np.log(_flat(chosen))[:, None] - bounds), axis=1) < margin)
 
 
-def _grown(
-    sample: Sample, drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
-) -> dict[str, float]:
+def _grown(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> dict[str, float]:
     """Return the factor by which terms increase the standard error of each plain parameter.
 
     With X the columns of terms and shapes, M = 1 - W (W^T W + 1)^-1 W^T and T = (W^T W + 1)^-1 W^T
     X, the covariance (W^T W + 1)^-1 of the base parameters becomes that plus T (X^T M X)^-1 T^T.
     """
-    families = [family for family, _ in chosen]
-    if not families:
+    if not chosen:
         return {}
-    _, trial = _with_slopes(sample, drive, families, _flat(chosen))
+    _, trial = _with_slopes(sample, drive, chosen)
     T, S = trial.T[:, :-1], trial.S[:-1, :-1]
     _, before = sample.normal.whole
     grown = {}
@@ -516,9 +421,7 @@ def _grown(
     return grown
 
 
-def _reweighted(
-    sample: Sample, drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
-) -> Sample:
+def _reweighted(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> Sample:
     """Return the samples with the joint's weights from its residual with the new terms.
 
     With the residual without them the weights of this joint would be far too small, compared with
@@ -527,69 +430,53 @@ def _reweighted(
     if not chosen:
         return sample
     terms = _terms(drive, chosen)
-    whole = _trials(sample, drive, terms).whole
+    whole = Trials(sample, drive.columns(terms)[:, None]).whole
     before, after = (float(whole.left(which).sum()) for which in ([], list(range(len(terms)))))
-    return sample.reweighted(np.sqrt(before / max(after, _SHARPEST * before, _NOTHING)))
+    return sample.reweighted(
+        np.sqrt(before / max(after, decisions.TINY * before, decisions.NOTHING))
+    )
 
 
-def _terms(
-    drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
-) -> tuple[DriveTerm, ...]:
+def _terms(drive: _Drive, chosen: Sequence[_Sized]) -> tuple[DriveTerm, ...]:
     """Return the terms of families with their shapes."""
     return tuple(term for family, own in chosen for term in family.make(drive.data_range, *own))
 
 
-def _log_bounds(drive: _Drive, families: Sequence[Family]) -> Array:
+def _log_bounds(drive: _Drive, chosen: Sequence[_Sized]) -> Array:
     """Return the logarithms of the search range of each shape, shape (k, 2)."""
-    bounds = [shape.within(drive.data_range) for family in families for shape in family.shapes]
-    logs: Array = np.log(np.reshape(bounds, (-1, 2)))
-    return logs
+    bounds = [shape.within(drive.data_range) for family, _ in chosen for shape in family.shapes]
+    return np.asarray(np.log(np.reshape(bounds, (-1, 2))))
 
 
-def _refined(
-    sample: Sample, drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
-) -> list[tuple[Family, list[float]]]:
+def _refined(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> list[_Sized]:
     """Return families with the nearby shapes that give the smallest residual together."""
     from scipy.optimize import minimize
 
-    families = [family for family, _ in chosen]
+    sized = partial(with_shapes, [family for family, _ in chosen])
     start = np.log(_flat(chosen))
+    if not len(start):
+        return sized(np.exp(start))
+    joined = _reweighted(sample, drive, chosen).joined()
 
     def left(log_sizes: Array) -> float:
-        terms = _terms(drive, with_shapes(families, np.exp(log_sizes)))
-        (squares,) = _trials(sample, drive, terms, ROUNDING).whole.left(list(range(len(terms))))
-        return float(np.log(squares + _NOTHING))
+        columns = drive.columns(_terms(drive, sized(np.exp(log_sizes))))
+        whole = Trials(joined, columns[:, None], decisions.ROUNDING).whole
+        (squares,) = whole.left(range(columns.shape[1]))
+        return float(np.log(squares + decisions.NOTHING))
 
-    best = start
-    if len(start):
-        sample = _reweighted(sample, drive, chosen).joined()
-        bounds, options = _log_bounds(drive, families), {"eps": STEP, "maxiter": _STEPS}
-        found = minimize(left, start, method="L-BFGS-B", bounds=bounds, options=options)
-        best = found.x if found.fun <= left(start) else start
-    return with_shapes(families, np.exp(best))
+    bounds, options = _log_bounds(drive, chosen), {"eps": decisions.STEP, "maxiter": _STEPS}
+    best = minimize(left, start, method="L-BFGS-B", bounds=bounds, options=options)
+    return sized(np.exp(best.x if best.fun <= left(start) else start))
 
 
-def _shape_covariance(
-    sample: Sample, drive: _Drive, families: Sequence[Family], flat: Array
-) -> Array:
-    """Return the covariance of shapes: of columns d(torque)/d(shape), fitted with all others."""
-    if not len(flat):
-        return np.empty((0, 0))
-    count, trial = _with_slopes(sample, drive, families, flat)
-    _, every = trial.estimate(list(range(count + len(flat))), sample.fitted)
-    covariance: Array = every[count:, count:]
-    return covariance
-
-
-def _with_slopes(
-    sample: Sample, drive: _Drive, families: Sequence[Family], flat: Array
-) -> tuple[int, Trial]:
+def _with_slopes(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> tuple[int, Trial]:
     """Return the number c of columns of terms, and a trial of them and of d(torque)/d(shape)."""
-    Z = drive.columns(_terms(drive, with_shapes(families, flat)))
-    theta = Trials(sample, Z[:, None], ROUNDING).whole.parameters(list(range(Z.shape[1])))
+    families, flat = [family for family, _ in chosen], _flat(chosen)
+    Z = drive.columns(_terms(drive, chosen))
+    theta = Trials(sample, Z[:, None], decisions.ROUNDING).whole.parameters(range(Z.shape[1]))
     slopes = np.empty((len(Z), len(flat)))
-    for k, h in enumerate(STEP * flat):
+    for k, h in enumerate(decisions.STEP * flat):
         larger = flat + h * (np.arange(len(flat)) == k)
         moved = drive.columns(_terms(drive, with_shapes(families, larger)))
         slopes[:, k] = (moved - Z) @ theta / h
-    return Z.shape[1], Trials(sample, np.hstack([Z, slopes])[:, None], ROUNDING).whole
+    return Z.shape[1], Trials(sample, np.hstack([Z, slopes])[:, None], decisions.ROUNDING).whole

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
@@ -13,123 +13,92 @@ import numpy as np
 
 from robotid.base.findings import Finding, listed, toml_key
 from robotid.base.typing import Array
+from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.residual.decisions import (
-    CONFIRMED,
-    MAIN,
-    MISFIT,
-    MISFIT_MATTERS,
-    MISFIT_REPORTED,
-    MISFIT_WARNS,
-    ONE_SIDED,
-    Round,
-    select,
-)
-from robotid.diagnosis.residual.term_trials import Sample, Trial, Trials
+from robotid.diagnosis.decisions import Round, select
+from robotid.diagnosis.residual.term_trials import Sample, Trials
 from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.estimation.fitting.fitted import Fit
 from robotid.robot.drive_term import DriveMotion, DriveTerm, Family
-from robotid.robot.drives import (
-    COUNTERBALANCE,
-    FAMILIES,
-    Harmonic,
-    drive_line,
-    has_turned,
-    spring_family,
-)
+from robotid.robot.drives import FAMILIES, Harmonic, drive_line, has_turned
 
 _RIPPLES = np.arange(5, 241)  # periods per revolution tested: 200 of a gear of 100 : 1
 _PEAKS = 6  # of them are tested: those with the largest periodic residual
 _STEEP = 8  # twice the order of the filter, which is applied in both directions
-_REVERSES = 0.05  # of the RMS speed, over which the sign of a coupling's speed changes
+_REVERSES = 0.05  # of the RMS value: width of a change of a coupling's direction or a gear's side
 _WINDUP = (0.02, 0.1)  # of the RMS displacement since a reversal: decay of a deflection
-_LOADED = 0.05  # of the RMS rigid-body torque, over which the loaded side of a gear changes
 _OF_POSITION = ("position_periodic", "spring", "position_offset")
-_BALANCES = ("counterbalance", "link_mass")
-_OF_MASSES = (*_BALANCES, "current_for_torque", "urdf_mismatch")
-_SPRINGS = ("ripple", "spring")  # parts of the torque that depend on the position
+_OF_MASSES = ("current_for_torque", "urdf_mismatch")
 _DIGITS = "0123456789"
 
 
 @dataclass(frozen=True)
 class Misfit:
-    """A term that the model of a joint's drive lacks.
-
-    Attributes:
-        joint: The joint.
-        term: The term.
-        share: Share of the joint's squared residual in held-out segments that it explains beyond
-            the terms found before it [-].
-        p_value: p-value of that share [-].
-        confirmed: The same share on the validation logs; None without one.
-        size: Its parameter, or its RMS torque, see the units of the term.
-        std_error: Standard error of the size.
-        unit: Unit of the size.
-        error: Residual of a fit without the term, over the torque [-].
-        shift: Change of the base parameters over their prior spread with it, shape (b,).
-        theta: The parameters of its columns, shape (c,).
-        scale: The motion that sets the scale of its columns.
-        entries: Entries of the joint in a job's [drives] that add it; none if there are none.
-        trend: Change of the friction at the RMS speed per minute, and its standard error [N m/min
-            or N/min], of a drift with time; NaN of other terms.
-    """
+    """A term that the model of a joint's drive lacks."""
 
     joint: str
     term: Candidate
+    #: Share of the joint's squared residual in held-out segments that it explains beyond the terms
+    #: found before it [-].
     share: float
-    p_value: float
-    confirmed: float | None
-    size: float
-    std_error: float
-    unit: str
-    error: float
-    shift: Array
-    theta: Array
-    scale: JointMotion
-    entries: tuple[str | DriveTerm, ...] = ()
+    p_value: float  # of that share [-]
+    confirmed: float | None  # the same share on the validation logs; None without one
+    size: float  # its parameter, or its RMS torque, see the units of the term
+    std_error: float  # of the size
+    unit: str  # of the size
+    error: float  # residual of a fit without the term, over the torque [-]
+    shift: Array  # (b,), change of the base parameters over their prior spread with it
+    theta: Array  # (c,), parameters of its columns
+    scale: JointMotion  # the motion that sets the scale of its columns
+    entries: tuple[str | DriveTerm, ...] = ()  # of the joint in [drives] that add it
+    #: Change of the friction at the RMS speed per minute, and its standard error [N m/min or
+    #: N/min], of a drift with time; NaN of other terms.
     trend: tuple[float, float] = (math.nan, math.nan)
 
     def torque(self, motion: JointMotion) -> Array:
         """Return the torque of the term along a motion of the joint, shape (N,) [N m or N]."""
-        torque: Array = self.term.columns(replace(motion, scale=self.scale)) @ self.theta
-        return torque
+        return np.asarray(self.term.columns(replace(motion, scale=self.scale)) @ self.theta)
 
     @property
     def matters(self) -> bool:
         """Whether it is a warning."""
         explained = np.sqrt(self.share) * self.error
-        is_denied = self.confirmed is not None and self.confirmed < CONFIRMED * self.share
+        is_denied = self.confirmed is not None and self.confirmed < decisions.CONFIRMED * self.share
         is_uncertain = is_denied or self.term.is_imitated
-        return bool(self.share >= MISFIT_WARNS and explained >= MISFIT_MATTERS and not is_uncertain)
+        return bool(
+            self.share >= decisions.MISFIT_WARNS
+            and explained >= decisions.MISFIT_MATTERS
+            and not is_uncertain
+        )
 
 
 def find_misfits(sample: Sample | None) -> tuple[Misfit, ...]:
     """Return the terms that would explain a part of the residual of a fit, the largest first."""
     if sample is None:
         return ()
-    found = [misfit for j in range(len(sample.joints)) for misfit in _of_joint(sample, j)]
-    coupled = [(m.joint, m.term.coupled) for m in found]
-    # a coupled drive loads both joints
+    misfits = [misfit for j in range(len(sample.joints)) for misfit in _of_joint(sample, j)]
+    coupled = [(m.joint, m.term.coupled) for m in misfits]  # a coupled drive loads both joints
     return tuple(
-        m for m in found
-        if not m.term.coupled or m.share > ONE_SIDED or (m.term.coupled, m.joint) in coupled
+        m for m in misfits
+        if not m.term.coupled
+        or m.share > decisions.ONE_SIDED or (m.term.coupled, m.joint) in coupled
     )  # fmt: skip
 
 
 def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
     """Yield the terms that a joint's drive model lacks, one after the other."""
-    motion = sample.motions[j]
-    if not sample.weight[: sample.rows, j].any() or not sample.torque[j]:
+    motion, fitted = sample.motions[j], slice(sample.rows)
+    weight, is_prismatic = sample.weight[fitted, j], bool(sample.is_prismatic[j])
+    if not weight.any() or not sample.torque[j]:
         return  # of a torque of 0 there is no relative error
-    fitted = slice(sample.rows)
-    periodic = ripples(motion.at(fitted), sample.weight[fitted, j], sample.r[fitted, j])
+    periodic = ripples(motion.at(fitted), weight, sample.r[fitted, j])
     every = (*CANDIDATES, *couplings(motion), *periodic)
-    own = [c for c in every if not (c.revolute_only and sample.is_prismatic[j])]
-    columns = [candidate.columns(motion) for candidate in own]
+    offered_terms = [c for c in every if not (c.revolute_only and is_prismatic)]
+    columns = [candidate.columns(motion) for candidate in offered_terms]
     ends = np.cumsum([x.shape[1] for x in columns]).tolist()
     place = {
         candidate: list(range(end - x.shape[1], end))
-        for candidate, x, end in zip(own, columns, ends, strict=True)
+        for candidate, x, end in zip(offered_terms, columns, ends, strict=True)
     }
     trials = Trials(sample.of_joint(j), np.hstack(columns)[:, None])
     held_out, whole = trials.held_out, trials.whole
@@ -137,80 +106,52 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
     total = before = held_out.left([])
     squares = float(total[: sample.fitted].sum())
     error = float(np.sqrt(squares / sample.torque[j]))
+    angle = 0.0 if is_prismatic else float(np.ptp(motion.q[fitted]))
 
     def offered() -> Round[Candidate]:
-        left = held_out.left_each({c: [*chosen, *place[c]] for c in own})
+        left = held_out.left_each({c: [*chosen, *place[c]] for c in offered_terms})
         return Round(before, left, sample.fitted, squares)
 
-    found = select(offered, MISFIT, lambda c: len(place[c]), attrgetter("tried"))
-    for this, best in found:
+    rounds = select(offered, decisions.MISFIT, lambda c: len(place[c]), attrgetter("tried"))
+    for this, best in rounds:
         if best is None:
             return
         share, new = this.share(best), place[best]
-        size, std_error, unit = _size(sample, j, best, whole, chosen, new)
-        theta = whole.parameters([*chosen, *new])[len(chosen) :]
+        every_new, with_new = [*chosen, *new], slice(len(chosen), None)
+        estimate, covariance = whole.estimate(every_new, sample.fitted)
+        estimate, covariance = estimate[with_new], covariance[with_new, with_new]
+        S = whole.S[new][:, new] / np.sum(weight**2)
+        size, std_error = _size(best, estimate, covariance, S)
+        unit = (best.units or ("N m rms", "N rms"))[int(is_prismatic)]
+        trend = (math.nan, math.nan)
+        if best.code == "drift":
+            speed = float(np.sqrt(np.mean(motion.v[fitted] ** 2)))
+            per_minute = np.array([1.0, speed, 0.0]) * 60.0 / motion.longest  # direction, v and 1
+            trend_error = float(np.sqrt(per_minute @ covariance @ per_minute))
+            trend = float(per_minute @ estimate), trend_error
+        theta = whole.parameters(every_new)[with_new]
+        families = [name for name in best.families if has_turned(name, angle)]
         unfitted = [
-            whole.left(which)[sample.fitted :].sum() for which in ([], chosen, [*chosen, *new])
+            float(whole.left(which)[sample.fitted :].sum()) for which in ([], chosen, every_new)
         ]
-        if np.sqrt(share) * error >= MISFIT_REPORTED:
+        if np.sqrt(share) * error >= decisions.MISFIT_REPORTED:
             yield Misfit(
-                joint=sample.joints[j],
-                term=best,
-                share=share,
-                p_value=this.p_value(best),
-                confirmed=float((unfitted[1] - unfitted[2]) / unfitted[0])
-                if unfitted[0] > 0
-                else None,
-                size=size,
-                std_error=std_error,
-                unit=unit,
-                error=error,
-                shift=-whole.T[: len(sample.U), new] @ theta,
-                theta=theta,
-                scale=motion,
-                entries=_entries(sample, j, best),
-                trend=_trend(sample, j, best, whole, chosen, new),
-            )
-        chosen += new
-        before, own = this.left[best], [c for c in own if c.code != best.code]
+                sample.joints[j], best, share, this.p_value(best),
+                (unfitted[1] - unfitted[2]) / unfitted[0] if unfitted[0] > 0 else None,
+                size, std_error, unit, error, -whole.T[: len(sample.U), new] @ theta, theta,
+                motion, tuple(families[:1]) or best.terms, trend,
+            )  # fmt: skip
+        chosen = every_new
+        before, offered_terms = this.left[best], [c for c in offered_terms if c.code != best.code]
 
 
-def _entries(sample: Sample, j: int, term: Candidate) -> tuple[str | DriveTerm, ...]:
-    """Return the entries of a joint in a job's [drives] that add a term; none if there are none."""
-    angle = 0.0 if sample.is_prismatic[j] else float(np.ptp(sample.motions[j].q[: sample.rows]))
-    families = [name for name in term.families if has_turned(name, angle)]
-    return tuple(families[:1]) or term.terms
-
-
-def _trend(
-    sample: Sample, j: int, term: Candidate, whole: Trial, before: list[int], new: list[int]
-) -> tuple[float, float]:
-    """Return the change of the friction at the RMS speed per minute, of a drift, and its error."""
-    if term.code != "drift":
-        return math.nan, math.nan
-    theta, covariance = whole.estimate([*before, *new], sample.fitted)
-    own, motion = slice(len(before), None), sample.motions[j].at(slice(sample.rows))
-    speed = float(np.sqrt(np.mean(motion.v**2)))
-    per_minute = np.array([1.0, speed, 0.0]) * 60.0 / motion.longest  # of direction, v and 1
-    error = float(np.sqrt(per_minute @ covariance[own, own] @ per_minute))
-    return float(per_minute @ theta[own]), error
-
-
-def _size(
-    sample: Sample, j: int, term: Candidate, whole: Trial, before: list[int], new: list[int]
-) -> tuple[float, float, str]:
-    """Return the size of a term fitted with those found before, its standard error and unit."""
-    theta, covariance = whole.estimate([*before, *new], sample.fitted)
-    own = slice(len(before), None)
-    theta, covariance, S = theta[own], covariance[own, own], whole.S[new][:, new]
+def _size(term: Candidate, theta: Array, covariance: Array, S: Array) -> tuple[float, float]:
+    """Return the size of a term and its standard error: a parameter, or its RMS torque."""
     if term.units is not None:
-        error = float(np.sqrt(covariance[0, 0]))
-        return float(theta[0]), error, term.units[int(sample.is_prismatic[j])]
+        return float(theta[0]), float(np.sqrt(covariance[0, 0]))
     # RMS torque that base parameters cannot explain: size^2 = theta^T S theta
-    S = S / np.sum(sample.weight[: sample.rows, j] ** 2)
     size, slope = float(np.sqrt(theta @ S @ theta)), S @ theta
-    error = float(np.sqrt(slope @ covariance @ slope)) / size
-    return size, error, ("N m rms", "N rms")[int(sample.is_prismatic[j])]
+    return size, float(np.sqrt(slope @ covariance @ slope)) / size
 
 
 @dataclass(frozen=True)
@@ -265,15 +206,13 @@ def _of_family(family: Family) -> Candidate:
 def _ripple(m: JointMotion, count: int) -> Array:
     """Return cosine and sine of a multiple of the position, after the filter of torques."""
     waves = np.array([np.cos(count * m.q), np.sin(count * m.q)])
-    columns: Array = (_passed(m, np.array([count])) * waves).T
-    return columns
+    return np.asarray((_passed(m, np.array([count])) * waves).T)
 
 
 def _passed(m: JointMotion, counts: Array) -> Array:
     """Return the filter's gain for torques with k periods per revolution, shape (k, N)."""
     rate = np.abs(m.v) / (2 * np.pi * m.passes)  # revolutions per second over the cut-off
-    passed: Array = 1.0 / (1.0 + np.outer(counts.astype(float) ** _STEEP, rate**_STEEP))
-    return passed
+    return np.asarray(1.0 / (1.0 + np.outer(counts.astype(float) ** _STEEP, rate**_STEEP)))
 
 
 def ripples(m: JointMotion, weight: Array, r: Array) -> tuple[Candidate, ...]:
@@ -302,12 +241,13 @@ def ripples(m: JointMotion, weight: Array, r: Array) -> tuple[Candidate, ...]:
 def _windup(m: JointMotion) -> Array:
     displacement = m.travelled[:, None] / (np.array(_WINDUP) * _rms(m, attrgetter("travelled")))
     deflection = m.direction[:, None] * np.exp(-displacement)
-    return np.column_stack([deflection, np.tanh(m.load / (_LOADED * _rms(m, attrgetter("load"))))])
+    return np.column_stack(
+        [deflection, np.tanh(m.load / (_REVERSES * _rms(m, attrgetter("load"))))]
+    )
 
 
 def _drift(m: JointMotion) -> Array:
-    drifting: Array = m.time[:, None] * np.column_stack([m.direction, m.v, np.ones_like(m.v)])
-    return drifting
+    return np.asarray(m.time[:, None] * np.column_stack([m.direction, m.v, np.ones_like(m.v)]))
 
 
 def _coupled(m: JointMotion, other: str, ratio: float) -> Array:
@@ -360,11 +300,6 @@ def couplings(motion: JointMotion) -> tuple[Candidate, ...]:
     )  # fmt: skip
 
 
-def misfit_findings(fit: Fit, misfits: Sequence[Misfit], on_misfit: Sequence[str]) -> list[Finding]:
-    """Return a finding for each term that a drive model lacks."""
-    return [_finding(misfit, fit, on_misfit) for misfit in misfits]
-
-
 def setting_of(misfit: Misfit, fit: Fit) -> str:
     """Return the entry of a job file that adds a term to the model; empty if there is none.
 
@@ -391,47 +326,13 @@ def with_entries(fit: Fit, joint: str, entries: Sequence[str | DriveTerm]) -> st
     return drive_line(joint, *stated, *others, *entries)
 
 
-def counterbalanced(found: Sequence[Finding], logs: Sequence[str]) -> dict[str, str]:
-    """Return the family of the counterbalance of each joint with one in the fitted logs."""
-    return {
-        joint: spring_family(one.evidence["turned"], COUNTERBALANCE)
-        for one in found
-        for joint in one.joints
-        if one.code in _BALANCES and one.log in logs
-    }
-
-
-def with_known_springs(
-    found: Sequence[Finding], fit: Fit, wanted: Mapping[str, Sequence[str] | None]
-) -> list[Finding]:
-    """Return the findings before a fit; a counterbalance that its model includes becomes a note.
-
-    A spring that a wrong mass would imitate becomes a note only if it was stated, not selected.
-    """
-    own = fit.model.layout.own
-    springs = {joint for joint, terms in own.items() if any(t.part in _SPRINGS for t in terms)}
-    auto = [c for c in fit.drives if wanted[c.joint] is None]
-    selected = {c.joint for c in auto if any(t.part in _SPRINGS for t in c.terms)}
-    known = {"counterbalance": springs, "link_mass": springs - selected}
-
-    def as_known(one: Finding) -> Finding:
-        joint = one.joints[0] if one.joints else ""
-        if joint not in known.get(one.code, ()):
-            return one
-        names = listed(term.name for term in own[joint] if term.part in _SPRINGS)
-        remedy = f". The model includes it: {names} of {{joint}}"
-        return one.reworded(severity="note", remedy=remedy)
-
-    return [as_known(one) for one in found]
-
-
-def settled(found: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Finding]:
+def settled(before: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Finding]:
     """Return the findings before and of the fit, without hypotheses that a term explains.
 
     The doctor's model has no springs: it attributes a torque that depends on the position to wrong
     masses, or to nothing. The term that explains it is then a warning, even if it is small.
     """
-    rest, terms = list(found), []
+    rest, terms = list(before), []
     for term in of_fit:
         hypotheses = [f for f in rest if _explains(term, f)]
         rest = [f for f in rest if f not in hypotheses]
@@ -448,7 +349,7 @@ def settled(found: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Finding
 
 def _explains(term: Finding, hypothesis: Finding) -> bool:
     """Return whether a term of the fit explains a hypothesis from before the fit."""
-    if term.evidence.get("share_pct", 0.0) < MAIN:
+    if term.evidence.get("share_pct", 0.0) < decisions.MAIN:
         return False
     if hypothesis.code == "unexplained_torque":
         return bool(hypothesis.joints) and hypothesis.joints == term.joints
@@ -467,16 +368,14 @@ def _advice(term: Candidate, setting: str) -> str:
     return f"{term.advice}, or {added}" if term.advice else f"{added[0].upper()}{added[1:]}"
 
 
-def _finding(misfit: Misfit, found: Fit, on_misfit: Sequence[str]) -> Finding:
+def misfit_finding(misfit: Misfit, fit: Fit, on_misfit: Sequence[str]) -> Finding:
+    """Return the finding for a term that a drive model lacks."""
     term, validation = misfit.term, misfit.confirmed
     wide = [name for name in on_misfit if name.startswith(f"{misfit.joint}.")]
     figures = {
-        "share_pct": 100 * misfit.share,
-        "error_pct": 100 * misfit.error,
-        "size": misfit.size,
-        "std_error": misfit.std_error,
-        "p_value": misfit.p_value,
-    }
+        "share_pct": 100 * misfit.share, "error_pct": 100 * misfit.error, "size": misfit.size,
+        "std_error": misfit.std_error, "p_value": misfit.p_value,
+    }  # fmt: skip
     change, error = misfit.trend
     drifts = not math.isnan(change)
     if drifts:
@@ -484,7 +383,7 @@ def _finding(misfit: Misfit, found: Fit, on_misfit: Sequence[str]) -> Finding:
     if validation is not None:
         percent = 100 * validation
         figures |= {"validation_share_pct": percent, "validated_pct": max(percent, 0.0)}
-    cure = _advice(term, setting_of(misfit, found)) or "The model has no such term"
+    cure = _advice(term, setting_of(misfit, fit)) or "The model has no such term"
     return finding(
         term.code, "", misfit.joint, severity="warning" if misfit.matters else "note",
         meaning=term.meaning, unit=misfit.unit, trend_unit=misfit.unit.removesuffix(" rms"),

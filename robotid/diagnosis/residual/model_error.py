@@ -14,40 +14,36 @@ cancel: W T theta - z theta. Hence each term is stored as an ``OpenTerm``, with 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.diagnosis.residual.decisions import GROWN, ROUNDING, STEP
+from robotid.diagnosis.decisions import GROWN, ROUNDING, STEP, TINY
 from robotid.diagnosis.residual.misfit import Misfit
 from robotid.diagnosis.residual.term_trials import Sample, Trial, Trials, take_sample
 from robotid.dynamics.prediction import drive_motion_along
-from robotid.estimation.fitting.drive_terms import JointMotion, OpenTerm
+from robotid.estimation.fitting.drive_terms import DriveChoice, JointMotion, OpenTerm
 from robotid.estimation.fitting.fitted import Fit, Solution
 from robotid.robot.drive_term import DriveMotion, DriveTerm
 
-if TYPE_CHECKING:
-    from robotid.estimation.fitting.drive_terms import DriveChoice
-
 _MOVES = 0.2  # change of a shape in standard errors above which the fit is repeated
-_PINNED = 1e-6  # of the smallest prior spread: spread of a parameter that is fixed
 
 
 def with_model_error(
-    found: Fit, sample: Sample | None, misfits: Sequence[Misfit]
+    fit: Fit, sample: Sample | None, misfits: Sequence[Misfit]
 ) -> tuple[Fit, tuple[str, ...]]:
     """Return a fit whose standard errors include the errors of its drive model."""
     if sample is None:
-        return found, ()
-    motions = _motions(found, sample) if found.drives else []
-    found = _wider(found, sample, list(_of_shapes(found, sample, motions)))
-    found = _wider(found, sample, list(_of_undecided(found, sample, motions)))
-    wider = _wider(found, sample, [_of_misfit(misfit) for misfit in misfits])
-    before, after = found.standard_error, wider.standard_error
-    drives = np.arange(len(before)) >= found.model.layout.n_inertial
+        return fit, ()
+    motions = _motions(fit, sample) if fit.drives else []
+    fit = _wider(fit, sample, list(_of_shapes(fit, sample, motions)))
+    fit = _wider(fit, sample, list(_of_undecided(fit, sample, motions)))
+    lacking = [_Move(m.joint, m.shift, partial(_of_misfit, m)) for m in misfits]
+    wider = _wider(fit, sample, lacking)
+    before, after = fit.standard_error, wider.standard_error
+    drives = np.arange(len(before)) >= fit.model.layout.n_inertial
     grown = np.flatnonzero(drives & np.isfinite(before) & (after > GROWN * before))
-    return wider, tuple(found.mapping.names[i] for i in grown)
+    return wider, tuple(fit.mapping.names[i] for i in grown)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,94 +52,77 @@ class _Move:
 
     joint: str
     shift: Array  # of base parameters over their spread, (b,)
-    torque: Callable[[DriveMotion, JointMotion], Array]
+    torque: Callable[[DriveMotion, JointMotion], Array]  # (N,)
 
 
-def _wider(found: Fit, sample: Sample, moved: Sequence[_Move]) -> Fit:
+def _wider(fit: Fit, sample: Sample, moved: Sequence[_Move]) -> Fit:
     """Return a fit with the errors from further uncertain parts of its drive models."""
     if not moved:
-        return found
+        return fit
     X = sample.U.T @ np.column_stack([move.shift for move in moved])  # (b, m), base parameters
-    GX = _gain(found) @ X
-    terms = [
-        OpenTerm(move.joint, moves, move.torque) for move, moves in zip(moved, GX.T, strict=True)
-    ]
+    spread = fit.prior_std
+    least = TINY * float(spread[spread > 0].min())  # a fixed parameter hardly changes
+    GX = fit.mapping.gain(np.maximum(spread, least)) @ X  # (p, m), standard parameters
+    terms = [OpenTerm(x.joint, moves, x.torque) for x, moves in zip(moved, GX.T, strict=True)]
     return replace(
-        found,
-        standard_covariance=found.standard_covariance + GX @ GX.T,
-        base_error=np.sqrt(found.base_error**2 + np.sum(X**2, axis=1)),
-        open_terms=(*found.open_terms, *terms),
+        fit,
+        standard_covariance=fit.standard_covariance + GX @ GX.T,
+        base_error=np.sqrt(fit.base_error**2 + np.sum(X**2, axis=1)),
+        open_terms=(*fit.open_terms, *terms),
     )
 
 
-def _gain(found: Fit) -> Array:
-    """Return the gain from a change of base parameters to standard parameters, shape (p, b)."""
-    spread = found.prior_std
-    least = _PINNED * float(spread[spread > 0].min())  # a fixed parameter hardly changes
-    return found.mapping.gain(np.maximum(spread, least))
-
-
-def _of_shapes(found: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> Iterator[_Move]:
+def _of_shapes(fit: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> Iterator[_Move]:
     """Yield the uncertain directions of shapes.
 
     The errors of a joint's shapes are correlated: C_s = L L^T, one direction per column of L.
     """
-    for choice in found.drives:
+    for choice in fit.drives:
         if choice.shapes:
-            T = _shape_trial(found, choice, sample, motions).T[:, :-1]
+            T = _shape_trial(fit, choice, sample, motions).T[:, :-1]
             variance, axes = np.linalg.eigh(np.array(choice.shape_covariance))
             for axis in (axes * np.sqrt(np.maximum(variance, 0.0))).T:
-                torque = partial(_shape_change, found, choice, axis)
+                torque = partial(_shape_change, fit, choice, axis)
                 yield _Move(choice.joint, -(T @ axis), torque)
 
 
+def _of_misfit(misfit: Misfit, motion: DriveMotion, alone: JointMotion) -> Array:
+    """Return the torque of a term that the model lacks, shape (N,)."""
+    return misfit.torque(alone)
+
+
 def _shape_change(
-    found: Fit,
-    choice: "DriveChoice",
-    axis: Array,
-    motion: DriveMotion,
-    alone: JointMotion,
+    fit: Fit, choice: DriveChoice, axis: Array, motion: DriveMotion, alone: JointMotion
 ) -> Array:
     """Return the change of a drive's torque for a change of its shapes by (k,), shape (N,)."""
-    slopes = [shape_slope(found, choice, k, motion) for k in range(len(axis))]
+    slopes = [shape_slope(fit, choice, k, motion) for k in range(len(axis))]
     return np.asarray(np.column_stack(slopes) @ axis)
 
 
-def _of_misfit(misfit: Misfit) -> _Move:
-    """Return the uncertain part of a term that the model lacks."""
-
-    def torque(motion: DriveMotion, alone: JointMotion) -> Array:
-        return misfit.torque(alone)
-
-    return _Move(misfit.joint, misfit.shift, torque)
-
-
 def _shape_trial(
-    found: Solution, choice: "DriveChoice", sample: Sample, motions: Sequence[DriveMotion]
+    fit: Solution, choice: DriveChoice, sample: Sample, motions: Sequence[DriveMotion]
 ) -> Trial:
     """Return a trial of the columns d(torque)/d(shape) of a joint, with all that was fitted."""
-    j = sample.joints.index(choice.joint)
+    j, shapes = sample.joints.index(choice.joint), range(len(choice.shapes))
     slopes = [
-        np.column_stack(
-            [shape_slope(found, choice, k, motion.of(j)) for k in range(len(choice.shapes))]
-        )[rows]
+        np.column_stack([shape_slope(fit, choice, k, motion.of(j)) for k in shapes])[rows]
         for motion, rows in zip(motions, sample.taken, strict=True)
     ]
     return Trials(sample.of_joint(j), np.concatenate(slopes)[:, None], ROUNDING).whole
 
 
-def settled_shapes(found: Solution) -> "tuple[DriveChoice, ...] | None":
+def settled_shapes(fit: Solution) -> tuple[DriveChoice, ...] | None:
     """Return choices with shapes refitted now that all joints have their terms.
 
     One Gauss-Newton step: the step of a shape is the parameter of its column.
     """
-    sample = take_sample(found, for_drives=True)
-    if sample is None or not any(choice.shapes for choice in found.drives):
+    sample = take_sample(fit, for_drives=True)
+    if sample is None or not any(choice.shapes for choice in fit.drives):
         return None
-    motions, drives, farthest = _motions(found, sample), [], 0.0
-    for choice in found.drives:
+    motions, drives, farthest = _motions(fit, sample), [], 0.0
+    for choice in fit.drives:
         if choice.shapes:
-            whole = _shape_trial(found, choice, sample, motions)
+            whole = _shape_trial(fit, choice, sample, motions)
             step, covariance = whole.estimate(list(range(len(choice.shapes))), sample.fitted)
             moved = choice.moved(step, covariance)
             before, after = (np.array([s.value for s in c.shapes]) for c in (choice, moved))
@@ -154,20 +133,16 @@ def settled_shapes(found: Solution) -> "tuple[DriveChoice, ...] | None":
     return tuple(drives) if farthest > _MOVES else None
 
 
-def _of_undecided(found: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> Iterator[_Move]:
+def _of_undecided(fit: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> Iterator[_Move]:
     """Yield the uncertain parts of terms that were nearly selected."""
-    for choice in found.drives:
-        if not choice.undecided:
-            continue
+    for choice in (choice for choice in fit.drives if choice.undecided):
         j = sample.joints.index(choice.joint)
         columns = [
             np.column_stack([term.column(motion.of(j)) for term in choice.undecided])[rows]
             for motion, rows in zip(motions, sample.taken, strict=True)
         ]
-        Z = np.concatenate(columns)
-        whole = Trials(sample.of_joint(j), Z[:, None]).whole
-        theta = whole.parameters(list(range(len(choice.undecided))))
-
+        whole = Trials(sample.of_joint(j), np.concatenate(columns)[:, None]).whole
+        theta = whole.parameters(range(len(choice.undecided)))
         torque = partial(_of_terms, choice.undecided, theta)
         yield _Move(choice.joint, -whole.T[:, :-1] @ theta, torque)
 
@@ -179,21 +154,17 @@ def _of_terms(
     return np.asarray(np.column_stack([term.column(motion) for term in terms]) @ theta)
 
 
-def _motions(found: Solution, sample: Sample) -> list[DriveMotion]:
+def _motions(fit: Solution, sample: Sample) -> list[DriveMotion]:
     """Return the motion of the drives along each recording, see ``Sample.taken``."""
-    model = found.model.with_reference(found.standard)
+    model = fit.model.with_reference(fit.standard)
     return [drive_motion_along(model, x.trajectory) for x in sample.recordings]
 
 
-def shape_slope(found: Solution, choice: "DriveChoice", which: int, motion: DriveMotion) -> Array:
+def shape_slope(fit: Solution, choice: DriveChoice, which: int, motion: DriveMotion) -> Array:
     """Return the derivative of a drive's torque with respect to one of its shapes, shape (N,)."""
-    layout = found.model.layout
-    theta = dict(zip(layout.names, found.standard, strict=True))
-    size = choice.shapes[which].value * STEP
+    theta = dict(zip(fit.model.layout.names, fit.standard, strict=True))
     change = np.zeros_like(motion.v)
     for term, other in zip(choice.terms, choice.altered(which, STEP), strict=True):
-        change += theta[f"{choice.joint}.{term.name}"] * (
-            other.column(motion) - term.column(motion)
-        )
-    slope: Array = change / size
-    return slope
+        parameter = theta[f"{choice.joint}.{term.name}"]
+        change += parameter * (other.column(motion) - term.column(motion))
+    return np.asarray(change / (choice.shapes[which].value * STEP))

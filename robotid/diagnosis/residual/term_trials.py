@@ -23,14 +23,7 @@ import numpy as np
 
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
-from robotid.diagnosis.residual.decisions import (
-    FAMILY_P_VALUE,
-    FEWEST,
-    OUTLIER,
-    SEGMENTS,
-    SHORTEST,
-    p_value,
-)
+from robotid.diagnosis.decisions import FAMILY_P_VALUE, FEWEST, OUTLIER, SEGMENTS, SHORTEST, p_value
 from robotid.dynamics.constraint_rows import without_forces
 from robotid.dynamics.torque import trajectory_regressor
 from robotid.dynamics.used_rows import independent_share
@@ -97,29 +90,27 @@ class Sample:
     Rows of a floating base precede those of the n joints.
     """
 
-    joints: tuple[str, ...]  # Names of the n joints
-    is_prismatic: Array  # Which of them are prismatic, shape (n,), bool
-    motions: tuple[JointMotion, ...]  # Motion of each joint in the N samples
-    #: The fitted recordings, then the validation recordings, if they are used
-    recordings: tuple[Recording, ...]
-    at: tuple[Trajectory, ...]  # Their motions at these samples
-    taken: tuple[Array, ...]  # Indices of these samples in each recording
-    #: Weights of the torques, shape (N, n_rows) [1/(N m), 1/N]; one for all rows if constraint
-    #: forces were eliminated
+    joints: tuple[str, ...]
+    is_prismatic: Array  # (n,), bool
+    motions: tuple[JointMotion, ...]  # of each joint in the N samples
+    recordings: tuple[Recording, ...]  # the fitted ones, then those of validation, if used
+    at: tuple[Trajectory, ...]  # their motions at these samples
+    taken: tuple[Array, ...]  # indices of these samples in each recording
+    #: (N, n_rows), weights of the torques [1/(N m), 1/N]; one for all rows if constraint forces
+    #: were eliminated.
     weight: Array
-    torque: Array  # Weighted sum of the squared torques of fitted samples, shape (n_rows,)
-    #: Samples of each of the K segments, those of the validation logs last
-    segments: tuple[slice, ...]
-    rows: int  # Number of samples of fitted logs
-    #: Regressor of the base parameters over their prior spread, shape (N, n_rows, b), and columns
-    #: that are refitted with them
+    torque: Array  # (n_rows,), weighted sum of the squared torques of fitted samples
+    segments: tuple[slice, ...]  # samples of each of the K segments, of validation logs last
+    rows: int  # number of samples of fitted logs
+    #: (N, n_rows, b), regressor of the base parameters over their prior spread, and columns that
+    #: are refitted with them.
     W: Array
-    r: Array  # Residual of the estimate, shape (N, n_rows)
-    independent: Array  # Columns of the regressor that belong to base parameters, shape (b,), int
-    U: Array  # Factor of the prior covariance of base parameters, C = U^T U, shape (b, b)
-    normal: Normal  # Normal equations of the segments, of all joints of the robot
-    standard: Array  # Standard parameters of the estimate, shape (p,)
-    basis: Array | None = None  # As of ``Trajectory.basis``, at these samples
+    r: Array  # (N, n_rows), residual of the estimate
+    independent: Array  # (b,), columns of the regressor that belong to base parameters
+    U: Array  # (b, b), factor of the prior covariance of base parameters, C = U^T U
+    normal: Normal  # of the segments, all joints together
+    standard: Array  # (p,), standard parameters of the estimate
+    basis: Array | None = None  # as of ``Trajectory.basis``, at these samples
 
     @property
     def fitted(self) -> int:
@@ -145,27 +136,17 @@ class Sample:
         row = self.weight.shape[1] - len(self.joints) + j
         own, joint = slice(row, row + 1), slice(j, j + 1)
         alone = replace(
-            self,
-            joints=self.joints[joint],
-            is_prismatic=self.is_prismatic[joint],
-            motions=self.motions[joint],
-            weight=self.weight[:, own],
-            torque=self.torque[own],
-            W=np.ascontiguousarray(self.W[:, own]),
-            r=self.r[:, own],
-            basis=None,
-        )
+            self, joints=self.joints[joint], is_prismatic=self.is_prismatic[joint],
+            motions=self.motions[joint], weight=self.weight[:, own], torque=self.torque[own],
+            W=np.ascontiguousarray(self.W[:, own]), r=self.r[:, own], basis=None,
+        )  # fmt: skip
         if self.basis is None:
             return alone
         u = _lengths(self.basis)[:, own]
         tau = np.concatenate([motion.tau[:, own] for motion in self.at])
-        return replace(
-            alone,
-            weight=u * alone.weight,
-            torque=np.sum((alone.weight * tau / u)[: self.rows] ** 2, axis=0),
-            W=alone.W / u[..., None],
-            r=alone.r / u,
-        )
+        torque = np.sum((alone.weight * tau / u)[: self.rows] ** 2, axis=0)
+        weight, W, r = u * alone.weight, alone.W / u[..., None], alone.r / u
+        return replace(alone, weight=weight, torque=torque, W=W, r=r)
 
     @cached_property
     def own(self) -> Normal:
@@ -174,28 +155,19 @@ class Sample:
 
     def reweighted(self, factor: float) -> "Sample":
         """Return the samples of one joint with other weights."""
-        normal, more = self.normal, factor**2 - 1.0
+        more = factor**2 - 1.0
+        A, B = self.normal.A + more * self.own.A, self.normal.B + more * self.own.B
         return replace(
-            self,
-            weight=factor * self.weight,
-            torque=factor**2 * self.torque,
-            W=factor * self.W,
-            r=factor * self.r,
-            normal=replace(normal, A=normal.A + more * self.own.A, B=normal.B + more * self.own.B),
-        )
+            self, weight=factor * self.weight, torque=factor**2 * self.torque, W=factor * self.W,
+            r=factor * self.r, normal=replace(self.normal, A=A, B=B),
+        )  # fmt: skip
 
     def joined(self) -> "Sample":
         """Return the samples of fitted logs as one segment, for a fit to all of them."""
-        normal, rows = self.normal, slice(self.rows)
+        rows, normal = slice(self.rows), self.normal
         A, B = (x[: self.fitted].sum(axis=0, keepdims=True) for x in (normal.A, normal.B))
-        return replace(
-            self,
-            weight=self.weight[rows],
-            segments=(rows,),
-            W=self.W[rows],
-            r=self.r[rows],
-            normal=Normal(A, B, 1),
-        )
+        weight, W, r = self.weight[rows], self.W[rows], self.r[rows]
+        return replace(self, weight=weight, segments=(rows,), W=W, r=r, normal=Normal(A, B, 1))
 
 
 def take_sample(fit: Solution, *, for_drives: bool = False, is_free: bool = False) -> Sample | None:
@@ -233,25 +205,15 @@ def take_sample(fit: Solution, *, for_drives: bool = False, is_free: bool = Fals
     weight = used * np.sqrt(independent) / np.where(scale > 0, scale, np.inf)
     W = _in_units(Y, mapping.independent, U)
     W *= weight[:, :, None]
+    recordings = tuple(e.recording for e, _ in parts)
     sample = Sample(
-        joints=model.joints,
-        is_prismatic=np.isin(model.joints, list(model.layout.prismatic)),
-        motions=joint_motions([e.recording for e, _ in parts], rows, load, model),
-        recordings=tuple(e.recording for e, _ in parts),
-        at=tuple(motion),
-        taken=tuple(rows),
-        weight=weight,
-        torque=np.sum((weight * tau)[:own] ** 2, axis=0),
-        segments=segments,
-        rows=own,
-        W=W,
-        r=weight * r,
-        independent=mapping.independent,
-        U=U,
-        normal=Normal.of(W, weight * r, segments, number),
-        standard=fit.standard,
-        basis=basis,
-    )
+        joints=model.joints, is_prismatic=np.isin(model.joints, list(model.layout.prismatic)),
+        motions=joint_motions(recordings, rows, load, model), recordings=recordings,
+        at=tuple(motion), taken=tuple(rows), weight=weight,
+        torque=np.sum((weight * tau)[:own] ** 2, axis=0), segments=segments, rows=own, W=W,
+        r=weight * r, independent=mapping.independent, U=U,
+        normal=Normal.of(W, weight * r, segments, number), standard=fit.standard, basis=basis,
+    )  # fmt: skip
     return _free(sample, Y[..., mapping.independent]) if is_free else sample
 
 
@@ -338,8 +300,7 @@ def _in_units(Y: Array, independent: Array, U: Array) -> Array:
 def _lengths(basis: Array) -> Array:
     """Return sqrt(P_jj), the length of P e_j, of each row, shape (N, n_rows)."""
     squares = 1.0 - np.sum(basis**2, axis=2)
-    lengths: Array = np.sqrt(np.maximum(squares, _SHORTEST_UNIT**2))
-    return lengths
+    return np.asarray(np.sqrt(np.maximum(squares, _SHORTEST_UNIT**2)))
 
 
 def _noise_level(r: Array, used: Array, own: int, basis: Array | None) -> tuple[Array, Array]:
@@ -349,7 +310,9 @@ def _noise_level(r: Array, used: Array, own: int, basis: Array | None) -> tuple[
     """
     u = np.ones(r.shape) if basis is None else _lengths(basis)
     size = np.abs(r) / u
-    usual: Array = size <= OUTLIER * _typical_size(size[:own], used[:own])
+    columns = zip(size[:own].T, used[:own].T, strict=True)
+    typical = np.array([np.median(x[at]) if at.any() else np.inf for x, at in columns])
+    usual: Array = size <= OUTLIER * typical
     if basis is not None:
         usual = np.all(usual | ~used, axis=1, keepdims=True)
     used = used & usual
@@ -358,12 +321,6 @@ def _noise_level(r: Array, used: Array, own: int, basis: Array | None) -> tuple[
     if basis is not None:
         squares, freedom = (np.full(len(x), x.sum()) for x in (squares, freedom))
     return used, np.sqrt(squares / np.maximum(freedom, 1))
-
-
-def _typical_size(r: Array, used: Array) -> Array:
-    """Return the median absolute residual of each joint over the used samples, shape (n,)."""
-    columns = zip(r.T, used.T, strict=True)
-    return np.array([np.median(np.abs(x[k])) if k.any() else np.inf for x, k in columns])
 
 
 def _is_steady(recording: Recording) -> Array:
@@ -403,10 +360,8 @@ class Trial:
     def parameters(self, which: Sequence[int] | Array) -> Array:
         """Return the parameters of some columns, shape (..., k): which (m, k)."""
         S, k = self.S, np.asarray(which, dtype=int)
-        theta: Array = np.linalg.solve(
-            S[..., k[..., :, None], k[..., None, :]], S[..., k, -1][..., None]
-        )
-        return theta[..., 0]
+        products = S[..., k[..., :, None], k[..., None, :]]
+        return np.asarray(np.linalg.solve(products, S[..., k, -1][..., None])[..., 0])
 
     def estimate(self, which: Sequence[int], fitted: int) -> tuple[Array, Array]:
         """Return the parameters of some columns and their covariance, shapes (k,) and (k, k).
@@ -428,8 +383,7 @@ class Trial:
         with_r = np.concatenate([k, np.full((*k.shape[:-1], 1), -1)], axis=-1)
         x = np.concatenate([-theta, np.ones((*theta.shape[:-1], 1))], axis=-1)
         square = self.H[:, with_r[..., :, None], with_r[..., None, :]]
-        left: Array = (x[..., None, :] @ square @ x[..., :, None])[..., 0, 0]
-        return left
+        return np.asarray((x[..., None, :] @ square @ x[..., :, None])[..., 0, 0])
 
     def left_each(self, choices: Mapping[OptionT, Sequence[int]]) -> dict[OptionT, Array]:
         """Return the squared residual of each segment with columns of each option, shapes (K,)."""
@@ -444,20 +398,20 @@ def _each(
     choices: Mapping[OptionT, Sequence[int]], of: Callable[[Array], Array]
 ) -> dict[OptionT, Array]:
     """Evaluate a function of the columns of each option, all options of one size together."""
-    found: dict[OptionT, Array] = {}
+    results: dict[OptionT, Array] = {}
     for size in {len(which) for which in choices.values()}:
         alike = {x: which for x, which in choices.items() if len(which) == size}
-        found.update(zip(alike, of(np.array([*alike.values()])), strict=True))
-    return {x: found[x] for x in choices}
+        results.update(zip(alike, of(np.array([*alike.values()])), strict=True))
+    return {x: results[x] for x in choices}
 
 
 @dataclass(frozen=True, eq=False)
 class Trials:
     """Trials of columns."""
 
-    sample: Sample  # The samples
-    Z: Array  # Torques of parameters of 1, shape (N, n, c)
-    ridge: float = RIDGE  # Smallest share of a column that the regressor must not explain
+    sample: Sample
+    Z: Array  # (N, n, c), torques of parameters of 1
+    ridge: float = RIDGE
 
     @cached_property
     def held_out(self) -> Trial:

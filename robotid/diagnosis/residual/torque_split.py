@@ -16,14 +16,15 @@ from functools import cached_property
 
 import numpy as np
 
-from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import sentence_of
-from robotid.diagnosis.residual.decisions import (
-    DEPENDENCE_P_VALUE,
-    DEPENDENCE_SHARE,
+from robotid.diagnosis.decisions import (
     FEWEST,
+    LEAST_SHARE,
     OUTLIER,
+    P_VALUE,
+    ROUNDING,
+    SCATTERED,
     SEGMENTS,
     SHORTEST,
     p_value,
@@ -38,36 +39,24 @@ from robotid.robot.model import RobotModel
 _RIGID = ("gravity", "inertia", "Coriolis")
 _ROWS = 4000  # samples of all recordings together that are split
 _QUARTERS = 4  # parts of a recording for the test of a drift, and pieces of each part
-_ROUNDING = 1e-10  # of the torque, below which a part counts as 0
 _SLOW = 0.25  # of the RMS speed: below is low speed
 _NOISY = 0.5  # broadband share above which the residual counts as noise
 _BINS = 10  # of a quantity, with equal numbers of samples
-_FEWEST_IN_BIN = 3  # segments from which the scatter of a bin's mean is determined
 
 
 @dataclass(frozen=True, eq=False)
 class TorqueSplit:
     """Parts of predicted torques.
 
-    Attributes:
-        parts: "gravity", "inertia" and "Coriolis" (with centrifugal torques) of the bodies, then
-            the torques of the drives, by ``DriveTerm.part``; each of shape (N, n_rows) [N m, N].
-        names: Names of the k drive parameters.
-        kinds: Part that each of them belongs to.
-        terms: Torque of each of them at its drive, shape (k, N) [N m, N].
-        loads: Ratio of each row to the drive of each parameter, shape (n_rows, k) [-].
+    These are "gravity", "inertia" and "Coriolis" (with centrifugal torques) of the bodies, then the
+    torques of the drives, by ``DriveTerm.part``.
     """
 
-    parts: Mapping[str, Array]
-    names: tuple[str, ...]
-    kinds: tuple[str, ...]
-    terms: Array
-    loads: Array
-
-    @cached_property
-    def predicted(self) -> Array:
-        """The torque predicted, the sum of the parts, shape (N, n_rows) [N m, N]."""
-        return np.asarray(sum(self.parts.values()))
+    parts: Mapping[str, Array]  # each of shape (N, n_rows) [N m, N]
+    names: tuple[str, ...]  # of the k drive parameters
+    kinds: tuple[str, ...]  # part that each of them belongs to
+    terms: Array  # (k, N), torque of each of them at its drive [N m, N]
+    loads: Array  # (n_rows, k), ratio of each row to the drive of each parameter [-]
 
     @cached_property
     def load(self) -> Array:
@@ -86,25 +75,14 @@ class TorqueSplit:
 
 
 def split_torque(
-    model: RobotModel,
-    pi: Array,
-    q: Array,
-    v: Array,
-    a: Array,
-    direction: Array | None = None,
-    memory: Array | None = None,
-) -> TorqueSplit:
+    model: RobotModel, pi: Array, q: Array, v: Array, a: Array,
+    direction: Array | None = None, memory: Array | None = None,
+) -> TorqueSplit:  # fmt: skip
     """Return the parts of the torques that parameters predict.
 
     A static model has no torques of motion: gravity is the only part of the bodies.
     """
     layout, first = model.layout, model.n_rows - len(model.joints)
-    wanted = (len(q), model.n_rows)
-    if v.shape != wanted or a.shape != wanted or len(pi) != len(layout.names):
-        raise DataError(
-            f"v, a and pi have shapes {v.shape}, {a.shape} and {pi.shape}, wanted {wanted}, "
-            f"{wanted} and ({len(layout.names)},)"
-        )
     parts = dict(zip(_RIGID, rigid_parts(model, pi, q, v, a), strict=True))
     if model.is_static:
         parts = {"gravity": parts["gravity"]}
@@ -122,13 +100,11 @@ def split_torque(
 class Rows:
     """Samples of recordings, one after the other."""
 
-    recordings: tuple[str, ...]  # Names of the recordings
-    t: Array  # Time stamps, shape (N,) [s]
-    recording: Array  # Recording of each sample, shape (N,), int
-    segment: Array  # Uninterrupted segment of it, shape (N,), int
-    #: Segment that is held out in turn, shape (N,), int; None if the recordings are too short for
-    #: six
-    segments: Array | None
+    recordings: tuple[str, ...]  # names
+    t: Array  # (N,), time stamps [s]
+    recording: Array  # (N,), recording of each sample
+    segment: Array  # (N,), uninterrupted segment of it
+    segments: Array | None  # (N,), held out in turn; None: too short for six of them
 
     @property
     def time(self) -> Array:
@@ -153,32 +129,21 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class JointTorque:
-    """Torque of one row of the equations, its parts, and what its residual depends on.
+    """Torque of one row of the equations, its parts, and what its residual depends on."""
 
-    Attributes:
-        joint: Name of the row.
-        unit: Unit of its torque.
-        rows: The N samples.
-        used: Whether each sample is used, shape (N,), bool.
-        tau: Measured torque, shape (N,).
-        parts: Parts of the predicted torque, by name, each of shape (N,).
-        terms: Torque of each drive parameter, shape (N,), by part and name.
-        quantities: Quantities that the residual may depend on: unit and values, (N,), by name.
-        broadband: Share of the squared residual above the filter's cut-off: not correlated over
-            one period of it, or from sample to sample without a filter; None if not available.
-        fitted: The same for the fitted recordings; None if it is of them itself.
-    """
-
-    joint: str
-    unit: str
+    joint: str  # name of the row
+    unit: str  # of its torque
     rows: Rows
-    used: Array
-    tau: Array
-    parts: Mapping[str, Array]
-    terms: Mapping[str, Mapping[str, Array]]
+    used: Array  # (N,), whether each sample is used
+    tau: Array  # (N,), measured torque
+    parts: Mapping[str, Array]  # of the predicted torque, by name, each of shape (N,)
+    terms: Mapping[str, Mapping[str, Array]]  # (N,) of each drive parameter, by part and name
+    #: Quantities that the residual may depend on: unit and values, (N,), by name.
     quantities: Mapping[str, tuple[str, Array]]
+    #: Share of the squared residual above the filter's cut-off: not correlated over one period of
+    #: it, or from sample to sample without a filter; None if not available.
     broadband: float | None
-    fitted: JointTorque | None = None
+    fitted: JointTorque | None = None  # of the fitted recordings; None if it is of them itself
 
     @cached_property
     def residual(self) -> Array:
@@ -188,7 +153,7 @@ class JointTorque:
     @cached_property
     def present(self) -> tuple[str, ...]:
         """Names of the parts that are more than rounding in any row."""
-        least = _ROUNDING * float(np.abs(self.tau).max())
+        least = ROUNDING * float(np.abs(self.tau).max())
         return tuple(name for name, x in self.parts.items() if np.abs(x).max() > least)
 
     @property
@@ -213,14 +178,16 @@ class JointTorque:
         used = self.used & (np.abs(r) <= OUTLIER * np.median(np.abs(r[self.used])))
         everywhere, piece = np.zeros(int(used.sum()), dtype=int), self.rows.pieces[used]
         segments = None if self.rows.segments is None else self.rows.segments[used]
-        found = [follow("constant", self.unit, r[used], r[used], everywhere, segments)]
-        for name, (unit, x) in self.quantities.items():
-            if np.ptp(x[used]) > 0:
-                found.append(follow(name, unit, x[used], r[used], even_bins(x[used]), segments))
-        left = self._less_best(found)[0]
+        tested = [follow("constant", self.unit, r[used], r[used], everywhere, segments)]
+        tested += [
+            follow(name, unit, x[used], r[used], even_bins(x[used]), segments)
+            for name, (unit, x) in self.quantities.items()
+            if np.ptp(x[used]) > 0
+        ]
+        left = self._less_best(tested)[0]
         quarter = np.unique(piece // _QUARTERS, return_inverse=True)[1]
         time = follow("time", "s", self.rows.time[used], left[used], quarter, piece)
-        return (*found, time)
+        return (*tested, time)
 
     @cached_property
     def against_time(self) -> tuple[Array, str]:
@@ -230,9 +197,9 @@ class JointTorque:
         """
         return self._less_best(self.follows[:-1])
 
-    def _less_best(self, found: Sequence[Dependence]) -> tuple[Array, str]:
+    def _less_best(self, tested: Sequence[Dependence]) -> tuple[Array, str]:
         """Return the residual after the best quantity, and its name."""
-        best = self._best(found)
+        best = self._best(tested)
         if best is None or best.name not in self.quantities:
             return self.residual, ""
         means = np.interp(self.quantities[best.name][1], best.centres, best.means)
@@ -252,64 +219,66 @@ class JointTorque:
     def cause(self) -> tuple[str, str]:
         """The cause of the residual, and what to do."""
         rms, best = self.rms, self._best(self.follows)
-        name, slow = "" if best is None else best.name, False
-        if best is not None and name == "speed":
-            slow = abs(best.where) < _SLOW * self.size(self.quantities["speed"][1])
+        name, where, slow = "", 0.0, False
+        if best is not None:
+            name, where = best.name, best.where
+        if name == "speed":
+            slow = abs(where) < _SLOW * self.size(self.quantities["speed"][1])
+        quick = self.broadband or 0.0
         kinds = {
             "unused": bool(np.isnan(rms["measured"])),
             "zero": rms["measured"] == 0,
             "constant": name == "constant",
             "quantity": best is not None,
             "short": self.broadband is None or self.rows.segments is None,
-            "noise": (self.broadband or 0.0) >= _NOISY,
+            "noise": quick >= _NOISY,
             "slow": True,
         }
         kind = next(kind for kind, holds in kinds.items() if holds)
-        quick = self.broadband or 0.0
         share = {"noise": quick, "slow": 1.0 - quick}.get(kind, (best and best.share) or 0.0)
         cause = sentence_of(
             "residual:cause", what=kind, left=_percent(rms["residual"] / (rms["measured"] or 1.0)),
             share=_percent(share), name=name, unit=self.unit if best is None else best.unit,
-            size=0.0 if best is None else best.means[0], low=slow,
-            where=0.0 if best is None else best.where,
+            size=0.0 if best is None else best.means[0], low=slow, where=where,
             names=", ".join(d.name for d in self.follows if d.name != "constant"),
         )  # fmt: skip
-        what = "changed" if name and self._has_changed(name) else name or kind
+        before = () if self.fitted is None else self.fitted.follows
+        # the residual of the fitted recordings does not depend on this quantity
+        has_changed = any(
+            d.name == name and d.share is not None and not d.is_significant for d in before
+        )
+        what = "changed" if name and has_changed else name or kind
         return cause, sentence_of("residual:advice", what=what)
 
-    def _has_changed(self, name: str) -> bool:
-        """Whether the residual of the fitted recordings does not depend on a quantity."""
-        before = () if self.fitted is None else self.fitted.follows
-        return any(d.name == name and d.share is not None and not d.is_significant for d in before)
 
-
-def joint_torques(found: Fit) -> tuple[JointTorque, ...]:
+def joint_torques(fit: Fit) -> tuple[JointTorque, ...]:
     """Return the torque of each row, its parts, and what its residual depends on.
 
     The samples, at most 4000, are spread over the validation recordings, or over the fitted ones if
     there are none.
     """
-    validation = [e for e in found.validation if not e.is_refitted]
-    fitted = _torques_of(found, found.fitted)
+    validation = [e for e in fit.validation if not e.is_refitted]
+    fitted = _torques_of(fit, fit.fitted)
     if not validation:
         return fitted
-    judged = zip(_torques_of(found, validation), fitted, strict=True)
+    judged = zip(_torques_of(fit, validation), fitted, strict=True)
     return tuple(replace(torque, fitted=of_fit) for torque, of_fit in judged)
 
 
-def _torques_of(found: Fit, evaluations: Sequence[Evaluation]) -> tuple[JointTorque, ...]:
+def _torques_of(fit: Fit, evaluations: Sequence[Evaluation]) -> tuple[JointTorque, ...]:
     """Return the torque of each row in some recordings."""
-    model, pi = found.model, found.standard
-    most = _ROWS // len(evaluations)
-    own = [(e, spread_rows(len(e.recording.trajectory.t), most)) for e in evaluations]
-    motions = [e.recording.trajectory.at(k) for e, k in own]
-    splits = [split_torque(model, pi, m.q, m.v, m.a, m.direction, m.memory) for m in motions]
-    used = np.concatenate([e.recording.mask[k] for e, k in own])
+    model, most = fit.model, _ROWS // len(evaluations)
+    chosen = [(e, spread_rows(len(e.recording.trajectory.t), most)) for e in evaluations]
+    motions = [e.recording.trajectory.at(k) for e, k in chosen]
+    splits = [
+        split_torque(model, fit.standard, m.q, m.v, m.a, m.direction, m.memory) for m in motions
+    ]
+    used = np.concatenate([e.recording.mask[k] for e, k in chosen])
     q, v, a, tau = (
         np.concatenate([getattr(m, x) for m in motions]) for x in ("q", "v", "a", "tau")
     )
     load = np.concatenate([s.load for s in splits])
-    rows, broadband = _rows(own), _broadband_shares(evaluations)
+    rows, broadband = _rows(chosen), _broadband_shares(evaluations)
     judged = []
     for j, joint in enumerate(model.row_names):
         terms = [split.terms_of(j) for split in splits]  # equal in all
@@ -322,24 +291,17 @@ def _torques_of(found: Fit, evaluations: Sequence[Evaluation]) -> tuple[JointTor
         }
         if model.is_static:  # its samples are means of segments, without speeds
             quantities = {name: quantities[name] for name in ("position", "load")}
+        parts = {x: np.concatenate([s.parts[x][:, j] for s in splits]) for x in splits[0].parts}
+        by_part = {
+            part: {x: np.concatenate([split[part][x] for split in terms]) for x in own}
+            for part, own in terms[0].items()
+        }
         judged.append(
             JointTorque(
-                joint=joint,
-                unit=model.row_units[j],
-                rows=rows,
-                used=used[:, j],
-                tau=tau[:, j],
-                parts={
-                    x: np.concatenate([s.parts[x][:, j] for s in splits]) for x in splits[0].parts
-                },
-                terms={
-                    part: {x: np.concatenate([each[part][x] for each in terms]) for x in own}
-                    for part, own in terms[0].items()
-                },
-                quantities=quantities,
-                broadband=broadband[j],
+                joint, model.row_units[j], rows, used[:, j], tau[:, j], parts, by_part, quantities,
+                broadband[j],
             )
-        )
+        )  # fmt: skip
     return tuple(judged)
 
 
@@ -348,19 +310,19 @@ def spread_rows(count: int, most: int) -> Array:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
-def _rows(own: Sequence[tuple[Evaluation, Array]]) -> Rows:
+def _rows(chosen: Sequence[tuple[Evaluation, Array]]) -> Rows:
     """Return samples of recordings, cut into segments long enough to be held out in turn."""
-    counts = [len(k) for _, k in own]
+    counts = [len(k) for _, k in chosen]
     independent = sum(
         min(len(k), independent_share(e.recording.signals) * len(e.recording.trajectory.t))
-        for e, k in own
+        for e, k in chosen
     )
     many, total = min(SEGMENTS, int(independent / SHORTEST)), sum(counts)
     return Rows(
-        recordings=tuple(e.recording.name for e, _ in own),
-        t=np.concatenate([e.recording.trajectory.t[k] for e, k in own]),
-        recording=np.repeat(np.arange(len(own)), counts),
-        segment=np.concatenate([e.recording.trajectory.segment[k] for e, k in own]),
+        recordings=tuple(e.recording.name for e, _ in chosen),
+        t=np.concatenate([e.recording.trajectory.t[k] for e, k in chosen]),
+        recording=np.repeat(np.arange(len(chosen)), counts),
+        segment=np.concatenate([e.recording.trajectory.segment[k] for e, k in chosen]),
         segments=np.arange(total) * many // total if many >= FEWEST else None,
     )
 
@@ -397,25 +359,21 @@ class Dependence:
     """Dependence of the residual of a joint on a quantity."""
 
     name: str  # "constant", "position", "speed", "acceleration", "load" or "time"
-    unit: str  # Unit of the quantity
-    centres: Array  # Mean of the quantity in each bin, shape (B,)
-    means: Array  # Mean residual in each bin, shape (B,) [N m or N]
-    #: Standard error of these means, from their scatter between segments, shape (B,); NaN in bins
-    #: of fewer than three segments
+    unit: str  # of the quantity
+    centres: Array  # (B,), mean of the quantity in each bin
+    means: Array  # (B,), mean residual in each bin [N m or N]
+    #: (B,), standard error of these means, from their scatter between segments; NaN in bins of
+    #: fewer than three segments.
     errors: Array
     #: Share of the residual's variance that the means of other segments explain; None if there are
-    #: too few segments. A negative share means that they explain nothing
+    #: too few segments. A negative share means that they explain nothing.
     share: float | None
     p_value: float  # p-value of that share [-]
 
     @property
     def is_significant(self) -> bool:
         """Whether the dependence is significant, and large enough to matter."""
-        return (
-            self.share is not None
-            and self.share >= DEPENDENCE_SHARE
-            and self.p_value < DEPENDENCE_P_VALUE
-        )
+        return self.share is not None and self.share >= LEAST_SHARE and self.p_value < P_VALUE
 
     @property
     def where(self) -> float:
@@ -425,8 +383,9 @@ class Dependence:
 
     def at(self, x: Array) -> tuple[Array, Array]:
         """Return the mean residual and its standard error, linear between bins, shape (N,) each."""
-        curves = (np.interp(x, self.centres, y, np.nan, np.nan) for y in (self.means, self.errors))
-        mean, error = curves
+        mean, error = (
+            np.interp(x, self.centres, y, np.nan, np.nan) for y in (self.means, self.errors)
+        )
         return mean, error
 
 
@@ -452,7 +411,7 @@ def follow(
     Q = np.bincount(segment, r**2)
     present = (N > 0).sum(axis=0)
     scatter = np.sum((S - N * means) ** 2, axis=0) * present / np.maximum(present - 1, 1)
-    errors = np.where(present >= _FEWEST_IN_BIN, np.sqrt(scatter) / n, np.nan)
+    errors = np.where(present >= SCATTERED, np.sqrt(scatter) / n, np.nan)
     if K < FEWEST:
         return Dependence(name, unit, centres, means, errors, None, 1.0)
     N_other, S_other = n - N, S.sum(axis=0) - S  # of all segments but one
@@ -477,9 +436,8 @@ def friction_split(model: RobotModel, evaluation: Evaluation, pi: Array) -> tupl
 
     The first is tau - Y pi with pi without friction and offset, the second their torque.
     """
-    layout = model.layout
-    inertial = [True] * layout.n_inertial
-    stiff = np.array(inertial + [term.is_inertia for _, term in layout.drive_parameters])
-    trajectory = evaluation.recording.trajectory
+    layout, trajectory = model.layout, evaluation.recording.trajectory
+    is_drive_inertia = [term.is_inertia for _, term in layout.drive_parameters]
+    stiff = np.array([True] * layout.n_inertial + is_drive_inertia)
     moved, whole = predict(model, [np.where(stiff, pi, 0.0), pi], trajectory)
     return trajectory.tau - moved, whole - moved

@@ -1,27 +1,38 @@
-"""Audit of the inertials of a URDF: impossible, negative, assumed and rounded ones."""
+"""Audit of the inertials of a URDF: impossible, assumed, rounded ones, and against its geometry."""
 
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from robotid.base.findings import Finding, listed
+from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import finding
+from robotid.diagnosis.decisions import ROUNDING
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.robot.bodies import link_places
+from robotid.robot.geometry import body_points, kinematic_lengths
 from robotid.robot.model import RobotModel
+from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.prior import REASONS, assumed_masses
 from robotid.robot.tree import Inertial, Joint, Tree
 from robotid.robot.urdf_text import exact_angle, numbers
 
 #: Findings that take the URDF's masses as evidence.
 _OF_MASSES = (
-    "current_for_torque", "joint_origin", "link_mass", "payload", "torque_scale", "total_mass",
-    "urdf_mismatch",
+    "current_for_torque", "joint_origin", "payload", "torque_scale", "total_mass", "urdf_mismatch",
 )  # fmt: skip
-_SLACK = 1e-9  # relative violation of the triangle inequality that is rounding
-_NOISE = 1e-10  # smaller pivots, over the largest, are rounding errors
+_DENSEST, _LIGHTEST = 20_000.0, 10.0  # [kg/m^3] over the box: about solid tungsten, and foam
+_MARGIN = 0.1  # of the box's diagonal, by which a centre of mass may lie outside
+_LONGEST = 5.0**0.5  # ellipsoid of a body with half of its mass on each of two sides, over the box
+_SLENDER = 1.6  # ellipsoid over the length that the kinematics give; a uniform rod has 1.29
+_THIN = 0.01  # [m] least side of a box, so that thin sheets have a volume
+_SMALL = 1e-3  # share of the robot's mass below which a fault of a body is only a note
+_ROUND = tuple(10.0**k for k in range(-6, 3))  # inertias [kg m^2] and masses [kg] of templates
+_ALIKE = 1e-9  # relative difference of copied inertials, and of a sum of moments, by rounding
+_SIZE = 0.05  # largest relative difference of boxes of equal size
 
 
 def negative_masses(robot: ET.Element) -> Iterator[Finding]:
@@ -42,19 +53,13 @@ def assumed_inertials(model: RobotModel) -> list[Finding]:
         bodies = [body for body in model.layout.bodies if model.assumed.get(body) == code]
         if bodies:
             mass = sum(float(pi[10 * model.layout.bodies.index(body)]) for body in bodies)
-            findings.append(
+            findings += [
                 finding(
-                    code,
-                    subject=f"link {bodies[0]}",
-                    severity="warning",
-                    what="assumed",
-                    cure="assumed",
-                    reason=reason,
-                    links=listed(bodies, 12),
-                    bodies=len(bodies),
+                    code, subject=f"link {bodies[0]}", severity="warning", what="assumed",
+                    cure="assumed", reason=reason, links=listed(bodies, 12), bodies=len(bodies),
                     mass=mass,
                 )
-            )
+            ]  # fmt: skip
     return findings
 
 
@@ -63,7 +68,7 @@ def explained_by_assumed(model: RobotModel, found: Finding) -> bool:
     if found.code not in _OF_MASSES:
         return False
     rows = [name in found.joints for name in model.row_names]
-    carried = model.support()[rows if any(rows) else slice(None)].any(axis=0)
+    carried = model.support[rows if any(rows) else slice(None)].any(axis=0)
     return bool((carried & model.layout.owned_by(assumed_masses(model))).any())
 
 
@@ -91,9 +96,9 @@ def impossible_inertial(link: str, inertial: Inertial, matters: bool) -> Iterato
     A, B, C = np.linalg.eigvalsh([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]).tolist()
     margin = A + B - C
     faults = {
-        "negative": min(A, 0.0) < -_SLACK * abs(C),
-        "triangle": margin < -_SLACK * abs(C),
-        "flat": margin <= _SLACK * abs(C),
+        "negative": min(A, 0.0) < -_ALIKE * abs(C),
+        "triangle": margin < -_ALIKE * abs(C),
+        "flat": margin <= _ALIKE * abs(C),
     }
     what = next((key for key, holds in faults.items() if holds), "")
     if what and (inertial.mass != 0 or any(inertial.inertia)):
@@ -138,7 +143,7 @@ def weak_parameters(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding
 
 def _between(mapping: BaseMapping) -> int:
     """Return the number of pivots that are neither rounding errors nor large enough."""
-    return int(np.sum(mapping.pivots > _NOISE)) - len(mapping.K)
+    return int(np.sum(mapping.pivots > ROUNDING)) - len(mapping.K)
 
 
 def _rounded(tree: Tree) -> dict[str, dict[str, float]]:
@@ -175,3 +180,145 @@ def _carrying(tree: Tree) -> set[str]:
             carrying.add(at.name)
             at = arriving.get(at.parent)
     return carrying
+
+
+def audit_links(model: RobotModel) -> Iterator[Finding]:
+    """Yield implausible inertials of a robot.
+
+    A body is a moving link with all links that are fixed to it. The collision geometry is used,
+    or the visual one; a body whose geometry cannot be read is not checked.
+    """
+    yield from _templates(model)
+    points = body_points(model)
+    yield from audit_bodies(model, model.standard_parameters(), points)
+    yield from _copies(model, points)
+    unread = [body for body in model.layout.bodies if body not in points]
+    if unread and next(model.tree.robot.iter("mesh"), None) is not None:
+        link = unread[0]
+        yield finding("geometry_unread", subject=f"link {link}", link=link, bodies=len(unread))
+
+
+def audit_bodies(model: RobotModel, pi: Array, points: Mapping[str, Array]) -> Iterator[Finding]:
+    """Yield the bodies whose parameters are impossible in the box around their geometry.
+
+    A body without geometry is compared with the length that the kinematics give it.
+    """
+    J = pseudo_inertia(pi[: model.layout.n_inertial])
+    lengths = kinematic_lengths(model) if set(model.layout.bodies) - points.keys() else {}
+    parents = [i for i in model.pin_model.parents if i > 0] if lengths else []
+    inner = {model.layout.bodies[i - 1] for i in parents}  # the last ones end beyond their joints
+    for body, J_i in zip(model.layout.bodies, J, strict=True):
+        if not J_i[3, 3] > 0:
+            continue
+        is_note = J_i[3, 3] < _SMALL * np.abs(J[:, 3, 3]).sum()
+        if body in points:
+            faults = list(_against_geometry(body, J_i, points[body]))
+            if faults:  # the collision geometry may be a stand-in
+                everything = body_points(model, with_visual=True)
+                faults = list(_against_geometry(body, J_i, everything.get(body, points[body])))
+        else:
+            faults = list(_against_kinematics(body, J_i, lengths.get(body, np.inf), model.length))
+            is_note |= body not in inner
+        for fault in faults:
+            yield replace(fault, severity="note") if is_note else fault
+
+
+def _against_geometry(body: str, J: Array, points: Array) -> Iterator[Finding]:
+    """Yield the parameters of a body that are impossible in the box around its geometry."""
+    of_link, mass = {"subject": f"link {body}", "link": body}, float(J[3, 3])
+    low, high = points.min(axis=0), points.max(axis=0)
+    sides = np.maximum(high - low, _THIN)
+    diagonal = float(np.linalg.norm(sides))
+    centre = J[:3, 3] / mass
+    outside = float(np.linalg.norm(np.maximum(np.maximum(low - centre, centre - high), 0.0)))
+    if outside > _MARGIN * diagonal:
+        yield finding(
+            "com_outside", **of_link, what="box", centre=_metres(centre), low=_metres(low),
+            high=_metres(high), outside=outside,
+        )  # fmt: skip
+    density = mass / float(np.prod(sides))
+    if not _LIGHTEST <= density <= _DENSEST:
+        yield finding(
+            "density", **of_link, sides=_metres(sides), mass=mass, density=density,
+            least=_LIGHTEST, most=_DENSEST,
+        )  # fmt: skip
+    second = np.trace(J[:3, :3]) / mass - float(centre @ centre)  # mean square distance
+    farthest = float(np.max(np.sum((points - centre) ** 2, axis=1))) ** 0.5
+    gyration = max(float(second), 0.0) ** 0.5
+    if gyration > farthest + 0.5 * _THIN:
+        yield finding("gyration", **of_link, gyration=gyration, farthest=farthest)
+        return
+    variance = np.maximum(np.diag(J)[:3] / mass - centre**2, 0.0)  # (3,), of the mass [m^2]
+    lengths = 2.0 * np.sqrt(5.0 * variance)  # (3,), of the equivalent ellipsoid [m]
+    k = int(np.argmax(lengths / sides))
+    if lengths[k] > _LONGEST * sides[k]:
+        yield finding(
+            "ellipsoid", **of_link, what="box", cure="box", axis="xyz"[k], length=lengths[k],
+            side=sides[k], most=_LONGEST * sides[k],
+        )  # fmt: skip
+
+
+def _against_kinematics(body: str, J: Array, length: float, longest: float) -> Iterator[Finding]:
+    """Yield the parameters of a body without geometry that are impossible for its length [m].
+
+    A body may be wide where its joints are close: warnings need more than the longest of all bodies
+    allows.
+    """
+    of_link, centre = {"subject": f"link {body}", "link": body}, J[:3, 3] / J[3, 3]
+    distance = float(np.linalg.norm(centre))
+    if distance > max(length, longest):
+        yield finding(
+            "com_outside", **of_link, what="joint", centre=_metres(centre), distance=distance,
+            length=length, outside=distance - length,
+        )  # fmt: skip
+        return
+    variance = np.linalg.eigvalsh(J[:3, :3] / J[3, 3] - np.outer(centre, centre))[-1]  # [m^2]
+    ellipsoid = 2.0 * float(np.sqrt(5.0 * max(variance, 0.0)))
+    if ellipsoid > _SLENDER * length:
+        is_far = ellipsoid > _LONGEST * max(length, longest)
+        yield finding(
+            "ellipsoid", **of_link, severity="warning" if is_far else "note", what="joint",
+            cure="joint", length=ellipsoid, side=length, most=_SLENDER * length,
+        )  # fmt: skip
+
+
+def _templates(model: RobotModel) -> Iterator[Finding]:
+    """Yield inertials with the numbers of a template."""
+    for link, inertial in model.tree.inertials.items():
+        ixx, ixy, ixz, iyy, iyz, izz = inertial.inertia
+        is_isotropic = ixx == iyy == izz and ixy == ixz == iyz == 0
+        if not (is_isotropic and np.isclose(ixx, _ROUND, rtol=_ALIKE).any()):
+            continue
+        if inertial.mass in (*_ROUND, 0.5) or not np.any(inertial.com):
+            yield finding(
+                "default_inertial", subject=f"link {link}", what="template", cure="template",
+                link=link, mass=inertial.mass, moment=ixx,
+            )  # fmt: skip
+
+
+def _copies(model: RobotModel, points: dict[str, Array]) -> Iterator[Finding]:
+    """Yield links with the same inertial as a link of another size."""
+    groups: list[list[str]] = []
+    inertials = model.tree.inertials
+    values = {link: [x.mass, *x.com, *x.inertia] for link, x in inertials.items() if link in points}
+    for link in (body for body in model.layout.bodies if body in values):
+        for group in groups:
+            if np.allclose(values[link], values[group[0]], rtol=_ALIKE, atol=1e-12):
+                group.append(link)
+                break
+        else:
+            groups.append([link])
+    for group in groups:
+        boxes = np.sort([np.ptp(points[link], axis=0) for link in group], axis=1)
+        if len(group) < 2 or not boxes.any() or values[group[0]][0] <= 0:
+            continue
+        spread = float(np.max(np.abs(boxes - boxes[0])) / np.max(boxes))
+        if spread >= _SIZE:
+            yield finding(
+                "copied_inertial", subject=f"link {group[0]}", links=len(group), difference=spread,
+                names=listed(group),
+            )  # fmt: skip
+
+
+def _metres(values: Array) -> str:
+    return "(" + ", ".join(f"{value:.3g}" for value in values.tolist()) + ")"

@@ -15,12 +15,12 @@ from robotid.base.settings import require_flag, require_kind
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.urdf.inertials import (
     assumed_inertials,
+    audit_links,
     impossible_inertial,
     negative_masses,
     rounded_angles,
     weak_parameters,
 )
-from robotid.diagnosis.urdf.mesh_check import audit_links
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.factors import triangle_of
 from robotid.dynamics.torque import random_regressor
@@ -45,42 +45,25 @@ _NUMBERS = {
 
 @dataclass(frozen=True)
 class Structure:
-    """Number and identifiability of a robot's parameters, for any motion.
+    """Number and identifiability of a robot's parameters, for any motion."""
 
-    Attributes:
-        standard: Number of standard inertial parameters, ten per body.
-        base_inertial: Number of base parameters of the inertias alone.
-        base: The same with armature, viscous, Coulomb and offset of every joint.
-        rank: Rank of the regressor at random states; equal to ``base``.
-        condition: Condition number of the base regressor there, columns of length 1.
-        undetermined: Standard inertial parameters that load no joint in any motion.
-    """
-
-    standard: int
-    base_inertial: int
-    base: int
-    rank: int
-    condition: float
-    undetermined: tuple[str, ...]
+    standard: int  # standard inertial parameters, ten per body
+    base_inertial: int  # base parameters of the inertias alone
+    base: int  # the same with armature, viscous, Coulomb and offset of every joint
+    rank: int  # of the regressor at random states; equal to ``base``
+    condition: float  # condition number of the base regressor there, columns of length 1
+    undetermined: tuple[str, ...]  # standard inertial parameters that never load a joint
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """The result of the audit of a URDF.
+    """The result of the audit of a URDF."""
 
-    Attributes:
-        robot: Name of the robot, "" if the file has none.
-        joints: Names of its movable joints.
-        structure: Its parameters; None if no model can be built.
-        base_groups: The inertial base parameters as sums of standard parameters.
-        findings: The findings; ``where`` is "link NAME", "joint NAME" or "file NAME".
-    """
-
-    robot: str
-    joints: tuple[str, ...]
-    structure: Structure | None
-    base_groups: tuple[str, ...]
-    findings: tuple[Finding, ...]
+    robot: str  # its name, "" if the file has none
+    joints: tuple[str, ...]  # names of its movable joints
+    structure: Structure | None  # None if no model can be built
+    base_groups: tuple[str, ...]  # inertial base parameters as sums of standard parameters
+    findings: tuple[Finding, ...]  # ``where`` is "link NAME", "joint NAME" or "file NAME"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the inspection as plain values, as ``robotid inspect --json`` prints it."""
@@ -135,13 +118,9 @@ def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
     if not any(one.evidence["felt"] for one in rounded):
         findings += weak_parameters(model, full)
     structure = Structure(
-        standard=model.layout.n_inertial,
-        base_inertial=len(inertial.K),
-        base=len(full.K),
-        rank=len(full.K),
-        condition=_condition(model, full),
-        undetermined=inertial.unidentifiable,
-    )
+        model.layout.n_inertial, len(inertial.K), len(full.K), len(full.K),
+        _condition(model, full), inertial.unidentifiable,
+    )  # fmt: skip
     return Inspection(model.name, model.joints, structure, inertial.expressions, tuple(findings))
 
 

@@ -11,123 +11,102 @@ from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.residual.decisions import TENFOLD
-from robotid.diagnosis.residual.misfit import Misfit, misfit_findings
-from robotid.diagnosis.urdf.mesh_check import audit_bodies
-from robotid.diagnosis.verdict.evidence import GOOD, error_of, is_harmless_cost
+from robotid.diagnosis.decisions import SHARE_OF_ROWS, TENFOLD, TINY
+from robotid.diagnosis.residual.misfit import Misfit, misfit_finding
+from robotid.diagnosis.urdf.inertials import audit_bodies
 from robotid.diagnosis.verdict.parameter_table import correlated_parameters
-from robotid.diagnosis.verdict.scale_check import friction_shares
+from robotid.diagnosis.verdict.scale_check import DIFFERS, friction_shares
+from robotid.diagnosis.verdict.verdict import BEATEN, GOOD, SMALL, error_of, is_harmless_cost
 from robotid.estimation.estimators.consistent_fit import slabs
 from robotid.estimation.fitting.estimator_settings import BoundedSettings, ConsistentSettings
 from robotid.estimation.fitting.fitted import Fit
+from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.estimation.variation.variation import UnlikeRun, Variation
 from robotid.robot.bodies import density_share, held_parameters, least_density, negligible_bodies
 from robotid.robot.geometry import body_boxes, body_points
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
-_COSTS = 1.05  # residual over that of WLS above which bounds increase the torque error
 _FAR = 3.0  # a total mass differs from the URDF's at most by this factor
-_ROUNDING = 1e-6  # [m^2] tolerance of a body that touches its box
 _NAMED = 5  # outliers that a finding names
 _BIASED = 0.5, 2.0  # shift of a parameter by encoder noise, in standard errors: note, warning
 _COARSE = 0.1  # share of encoder noise over the largest one, from which a joint is named
 _DIFFERS = 1.2  # residual of a consistent fit over that of WLS above which it is reported
-_LITTLE = 5.0  # [%] ... as a note if the constraints add less to the torque error
 _SHRUNK = 0.1  # of the URDF's smallest eigenvalue: below, a body is barely possible
 _MUCH = 0.2  # ... if links on locked joints have more than this share of its mass
 _USER_BOUNDS = ("mass ", "total_mass ", "centre_of_mass ")
-_BEYOND = 0.02  # share of samples outside the fitted range of friction that is reported
 _DENSEST = 12_000.0  # [kg/m^3] of a link: lead has 11,340
 _UNLIKELY = 0.05  # share of the bodies that the errors allow below which one is not possible
 _AT_BOUND = 1e-3  # relative difference of a mass from a stated bound that determines it
 _VANISHED = 0.05  # share of a link's URDF mass below which the link has practically vanished
-_RESCALED = 0.1  # least difference from 1 of a factor between measured and predicted torque
-_LEFT = 1 / 3  # ... and the largest share of the squared error that it leaves
+_LEFT = 1 / 3  # largest share of the squared error that a gain of the torque leaves
 _MOSTLY = 0.6  # share of friction in a torque from which friction may have changed, too
 
 
 def fit_findings(
-    fit: Fit,
-    misfits: Sequence[Misfit] = (),
-    on_misfit: Sequence[str] = (),
+    fit: Fit, misfits: Sequence[Misfit] = (), on_misfit: Sequence[str] = (),
     discrepancies: Sequence[Finding] = (),
-) -> list[Finding]:
-    """Return the findings about a fit: undetermined parameters, outliers, costs of constraints."""
-    findings = _static_findings(fit)
+) -> Iterator[Finding]:  # fmt: skip
+    """Yield the findings about a fit: undetermined parameters, outliers, costs of constraints."""
+    if fit.model.is_static:
+        yield _of_static(fit)
     determined = fit.determination
     if determined.groups:
-        findings.append(
-            finding(
-                "undetermined", subject="base_parameters", described=determined.described(),
-                severity="warning" if fit.is_poorly_excited else "note", rank=determined.rank,
-                base=len(determined.names),
-            )
+        yield finding(
+            "undetermined", subject="base_parameters", described=determined.described(),
+            severity="warning" if fit.is_poorly_excited else "note", rank=determined.rank,
+            base=len(determined.names),
         )  # fmt: skip
-    findings += consistency_findings(fit)
-    findings += _bound_findings(fit)
-    findings += _total_mass(fit)
-    findings += _impossible_shapes(fit)
-    findings += _dense_bodies(fit)
-    findings += _outlier_findings(fit)
-    findings += misfit_findings(fit, misfits, on_misfit)
-    findings += [*_drive_findings(fit), *_correlated(fit)]
-    findings += discrepancies
-    findings += encoder_noise(fit)
-    findings += [
-        finding("validation_was_fitted", subject=e.recording.log.path, name=e.recording.name)
-        for e in fit.refitted
-    ]
-    return findings + _costs(fit)
+    yield from consistency_findings(fit)
+    at_bound = [x for x, is_at in zip(fit.model.layout.names, fit.at_bound, strict=True) if is_at]
+    if at_bound:
+        joints = list(dict.fromkeys(name.rpartition(".")[0] for name in at_bound))
+        names = listed(at_bound, _NAMED)
+        yield finding("at_bound", "", joints, subject=", ".join(at_bound), names=names)
+    for body in fit.estimate.details.get("relaxed", ()):
+        yield finding("extent_contradicted", subject=f"link {body}", link=body)
+    yield from (*_total_mass(fit), *_impossible_shapes(fit), *_dense_bodies(fit))
+    if fit.outliers:
+        yield _of_outliers(fit)
+    yield from (misfit_finding(misfit, fit, on_misfit) for misfit in misfits)
+    yield from (*_drive_findings(fit), *_correlated(fit), *discrepancies, *encoder_noise(fit))
+    for e in fit.refitted:
+        yield finding("validation_was_fitted", subject=e.recording.log.path, name=e.recording.name)
+    yield from _costs(fit)
 
 
-def _costs(fit: Fit) -> list[Finding]:
-    """Return the joints whose torque error the constraints increase.
+def _costs(fit: Fit) -> Iterator[Finding]:
+    """Yield the joints whose torque error the constraints increase.
 
     It is a note if they add little, sqrt(error^2 - wls^2) of the torque, the verdict does not count
     it, and the user states no constraint; and if WLS predicts unseen recordings worse.
     """
-    findings, wls, asked = [], fit.metrics("wls").per_joint, _asked(fit)
-    locked = _locked_links(fit)
+    wls, settings, locked = fit.metrics("wls").per_joint, fit.estimator, _locked_links(fit)
+    asked = ""  # the constraints that the user states
+    if isinstance(settings, BoundedSettings) and any(settings.constraints.values()):
+        keys = listed(key for key, value in settings.constraints.items() if value)
+        asked = f"the constraints in [estimator] ({keys}), "
     for joint, measured in fit.metrics().per_joint.items():
         free = wls[joint]
         if measured.rmse <= _DIFFERS * free.rmse:
             continue
         error, least = measured.relative_error_pct, free.relative_error_pct or 0.0
-        is_little = error is not None and error**2 - least**2 < _LITTLE**2
+        is_little = error is not None and error**2 - least**2 < SMALL**2
         is_little = is_little and is_harmless_cost(error or 0.0, least) and not (asked or locked)
         what = "overfitted" if joint in fit.overfitted else "costly"
         what = "little" if is_little else what
-        findings.append(
-            finding(
-                "constraint_costs", "", joint, severity="warning" if what == "costly" else "note",
-                what=what, cure=what, asked=asked, locked=locked, unit=measured.unit,
-                error_pct=error or 0.0, wls_error_pct=least, rmse=measured.rmse, wls_rmse=free.rmse,
-            )
+        yield finding(
+            "constraint_costs", "", joint, severity="warning" if what == "costly" else "note",
+            what=what, cure=what, asked=asked, locked=locked, unit=measured.unit,
+            error_pct=error or 0.0, wls_error_pct=least, rmse=measured.rmse, wls_rmse=free.rmse,
         )  # fmt: skip
-    return findings
 
 
-def _static_findings(fit: Fit) -> list[Finding]:
+def _of_static(fit: Fit) -> Finding:
     """Return a note on the samples of a static model, and on joints without Coulomb friction."""
-    if not fit.model.is_static:
-        return []
-    extents = [e.recording.extent for e in fit.fitted]
-    rows, samples = sum(x.samples for x in extents), sum(x.smooth for x in extents)
-    still = _drives_at_rest(fit)
-    return [
-        finding(
-            "static", subject="standard_parameters", cure=bool(still), still=listed(still),
-            rows=rows, samples=samples,
-        )
-    ]  # fmt: skip
-
-
-def _drives_at_rest(fit: Fit) -> list[str]:
-    """Return the names of drives whose friction has no direction in any used sample."""
-    layout = fit.model.layout
+    layout, extents = fit.model.layout, [e.recording.extent for e in fit.fitted]
     motions = [(e.recording.trajectory, e.recording.mask) for e in fit.fitted]
-    return [
+    still = [
         drive.name
         for d, (drive, ratios) in enumerate(zip(layout.drives, layout.drive_ratios, strict=True))
         if not any(
@@ -135,6 +114,10 @@ def _drives_at_rest(fit: Fit) -> list[str]:
             for motion, mask in motions
         )
     ]
+    return finding(
+        "static", subject="standard_parameters", cure=bool(still), still=listed(still),
+        rows=sum(x.samples for x in extents), samples=sum(x.smooth for x in extents),
+    )  # fmt: skip
 
 
 def _drive_findings(fit: Fit) -> Iterator[Finding]:
@@ -152,7 +135,7 @@ def _drive_findings(fit: Fit) -> Iterator[Finding]:
                 x, (low, high) = getattr(motion, key)[mask[:, j], j], choice.data_range[key]
                 x, low = (np.abs(x), 0.0) if key == "v" else (x, low)
                 share = float(np.mean((x < low) | (x > high))) if len(x) else 0.0
-                if share > _BEYOND:
+                if share > SHARE_OF_ROWS:
                     yield finding(
                         "beyond_range", "", choice.joint, share_pct=100 * share, low=low, high=high,
                         what={"q": "positions", "v": "speeds"}[key],
@@ -193,17 +176,13 @@ def _correlated(fit: Fit) -> Iterator[Finding]:
             )  # fmt: skip
 
 
-def not_written(log_errors: Sequence[Finding], inconsistent: str = "") -> list[Finding]:
-    """Return a warning that the URDF is not written, with the reason; nothing if it is written."""
+def not_written(log_errors: Sequence[Finding], inconsistent: str = "") -> Iterator[Finding]:
+    """Yield a warning that the URDF is not written, with the reason; nothing if it is written."""
     codes = listed(dict.fromkeys(error.code for error in log_errors))
     what = "codes" if log_errors else "inconsistent"
-    words = {"codes": codes, "estimator": inconsistent}
-    is_written = not (log_errors or inconsistent)
-    return (
-        []
-        if is_written
-        else [finding("urdf_not_written", subject="urdf", what=what, cure=what, **words)]
-    )
+    words = {"what": what, "cure": what, "codes": codes, "estimator": inconsistent}
+    if log_errors or inconsistent:
+        yield finding("urdf_not_written", subject="urdf", **words)
 
 
 def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]:
@@ -233,51 +212,46 @@ def _in_line(model: RobotModel) -> set[str]:
     return carrying & rotating | {name for name, own in carriers.items() if own & identified}
 
 
-def log_findings(logs: Sequence[Log]) -> list[Finding]:
-    """Return what was noted and assumed of logs, each once, with the names of its logs."""
+def log_findings(logs: Sequence[Log]) -> Iterator[Finding]:
+    """Yield what was noted and assumed of logs, each once, with the names of its logs."""
     logs_of: dict[tuple[str, str], list[str]] = {}
     for log in logs:
         for code, texts in (("log_note", log.notes), ("log_assumption", log.assumed)):
             for text in texts:
                 logs_of.setdefault((code, text), []).append(Path(log.path).name)
-    return [finding(code, ", ".join(names), text=text) for (code, text), names in logs_of.items()]
+    for (code, text), names in logs_of.items():
+        yield finding(code, ", ".join(names), text=text)
 
 
-def consistency_findings(fit: Fit) -> list[Finding]:
-    """Return findings about the consistency of a fit."""
-    findings, check = [], fit.mass_matrix
+def consistency_findings(fit: Fit) -> Iterator[Finding]:
+    """Yield findings about the consistency of a fit."""
+    check = fit.mass_matrix
     if not check.is_positive:
-        findings.append(
-            finding(
-                "mass_matrix", subject="standard_parameters", share=1 - check.positive_share,
-                cure=isinstance(fit.estimator, ConsistentSettings), poses=check.poses,
-                smallest=check.smallest_eigenvalue,
-            )
+        yield finding(
+            "mass_matrix", subject="standard_parameters", share=1 - check.positive_share,
+            cure=isinstance(fit.estimator, ConsistentSettings), poses=check.poses,
+            smallest=check.smallest_eigenvalue,
         )  # fmt: skip
     active = fit.estimate.details.get("active", ())
     bounds = [name for name in active if name.startswith(_USER_BOUNDS)]
     if bounds:
         why, words = _contradiction(fit)
         is_warning = why != "harmless" and bool(_stated(fit).intersection(bounds))
-        findings.append(
-            finding(
-                "active_bound", subject=", ".join(bounds), bounds=listed(bounds), why=why,
-                severity="warning" if is_warning else "note", **words,
-            )
+        yield finding(
+            "active_bound", subject=", ".join(bounds), bounds=listed(bounds), why=why,
+            severity="warning" if is_warning else "note", **words,
         )  # fmt: skip
-    return findings
 
 
-def _total_mass(fit: Fit) -> list[Finding]:
-    """Return an error if the total mass differs from the URDF's by more than a factor of 3."""
+def _total_mass(fit: Fit) -> Iterator[Finding]:
+    """Yield an error if the total mass differs from the URDF's by more than a factor of 3."""
     size = fit.model.layout.n_inertial
     pi = np.array([fit.prior, fit.standard])
     before, after = pi[:, :size:10].sum(axis=1).tolist()
     is_stated = fit.estimator.bounds.total is not None
-    if is_stated or not before > 0 or before / _FAR <= after <= _FAR * before:
-        return []
-    evidence = {"urdf": before, "identified": after, "far": _FAR}
-    return [finding("total_mass", subject="standard_parameters", **evidence)]
+    if not is_stated and before > 0 and not before / _FAR <= after <= _FAR * before:
+        evidence = {"urdf": before, "identified": after, "far": _FAR}
+        yield finding("total_mass", subject="standard_parameters", **evidence)
 
 
 def encoder_noise(fit: Fit) -> Iterator[Finding]:
@@ -310,12 +284,12 @@ def _is_within_box(fit: Fit, body: str, box: Array) -> bool:
     (J,) = pseudo_inertia(fit.standard[10 * i : 10 * i + 10])
     slack = np.einsum("ij,kji->k", J, slabs(box)) / J[3, 3]  # tr(J Q_k) / m
     centre = J[:3, 3] / J[3, 3]
-    is_inside = (box[0] <= centre) & (centre <= box[1]) & (slack >= -_ROUNDING)
+    is_inside = (box[0] <= centre) & (centre <= box[1]) & (slack >= -TINY)
     return bool(is_inside.all())
 
 
-def _impossible_shapes(fit: Fit) -> list[Finding]:
-    """Return the identified bodies that are not possible in their geometry.
+def _impossible_shapes(fit: Fit) -> Iterator[Finding]:
+    """Yield the identified bodies that are not possible in their geometry.
 
     As notes if the URDF's body is not possible either, or if the body is in the box of a fit with
     extents. Bodies of negligible mass are left out.
@@ -323,36 +297,33 @@ def _impossible_shapes(fit: Fit) -> list[Finding]:
     model, points = fit.model, body_points(fit.model)
     boxes, negligible = body_boxes(model), negligible_bodies(model)
     before = {(fault.code, fault.where) for fault in audit_bodies(model, fit.prior, points)}
-    findings = []
     for fault in audit_bodies(model, fit.standard, points):
         body = fault.words["link"]
         if body in negligible:  # it keeps the URDF's values, and has no effect
             continue
-        identified = f"as identified, {fault.fault}"
         if (fault.code, fault.where) in before:
             fault = fault.reworded(severity="note", remedy="; the URDF has the same fault")
-        elif _is_within_box(fit, body, boxes[body]):
-            remedy = "; it is within the margin of the fit"
-            fault = fault.reworded(severity="note", fault=identified, remedy=remedy)
         else:
+            fault = fault.reworded(fault=f"as identified, {fault.fault}")
             remedy = f". {_cure(fit, body)}. The predicted torque may still be right; do not use "
             remedy += "mass, centre of mass and inertia of this link"
-            fault = fault.reworded(fault=identified, remedy=remedy)
-        findings.append(fault)
-    return findings
+            if _is_within_box(fit, body, boxes[body]):
+                fault = fault.reworded(severity="note")
+                remedy = "; it is within the margin of the fit"
+            fault = fault.reworded(remedy=remedy)
+        yield fault
 
 
-def _dense_bodies(fit: Fit) -> list[Finding]:
-    """Return the identified bodies whose inertia needs a density above that of any material.
+def _dense_bodies(fit: Fit) -> Iterator[Finding]:
+    """Yield the identified bodies whose inertia needs a density above that of any material.
 
     As notes if the errors of mass and inertia allow a body of a material and no stated mass
-    determines it. Bodies that have this
-    density in the URDF are left out, and all of a result that is not physically consistent, which
-    is a reason of its own.
+    determines it. Bodies that have this density in the URDF are left out, and all of a result that
+    is not physically consistent, which is a reason of its own.
     """
     if not fit.is_consistent:
-        return []
-    findings, size = [], fit.model.layout.n_inertial
+        return
+    size = fit.model.layout.n_inertial
     before, after = (pi[:size].reshape(-1, 10) for pi in (fit.prior, fit.standard))
     for k, (body, was, now) in enumerate(zip(fit.model.layout.bodies, before, after, strict=True)):
         density = least_density(now)
@@ -365,16 +336,13 @@ def _dense_bodies(fit: Fit) -> list[Finding]:
         share = density_share(now, covariance, _DENSEST, np.random.default_rng(0))
         is_open = share > _UNLIKELY and not _stated_of(fit, body)
         is_finite = bool(np.isfinite(density))
-        findings.append(
-            finding(
-                "dense_body", subject=f"link {body}", severity="note" if is_open else "warning",
-                link=body, error=is_open, needs="finite" if is_finite else "none",
-                conclusion=is_open, cure=_cure(fit, body, excess), mass=now[0], density=density,
-                rounded=float(f"{density:.2g}") if is_finite else 0.0, densest=_DENSEST,
-                share=share, half_width=1.96 * np.sqrt(covariance[0, 0]),
-            )
+        yield finding(
+            "dense_body", subject=f"link {body}", severity="note" if is_open else "warning",
+            link=body, error=is_open, needs="finite" if is_finite else "none",
+            conclusion=is_open, cure=_cure(fit, body, excess), mass=now[0], density=density,
+            rounded=float(f"{density:.2g}") if is_finite else 0.0, densest=_DENSEST,
+            share=share, half_width=QUANTILE * np.sqrt(covariance[0, 0]),
         )  # fmt: skip
-    return findings
 
 
 def _cure(fit: Fit, body: str, excess: float = 0.0) -> str:
@@ -398,25 +366,8 @@ def _stated_of(fit: Fit, body: str) -> dict[str, float]:
     return {stated: mass} if is_at else {}
 
 
-def _bound_findings(fit: Fit) -> list[Finding]:
-    """Return notes on drive terms at 0, and warnings about bodies outside their geometry."""
-    findings, names = [], fit.model.layout.names
-    at_bound = [name for name, is_at in zip(names, fit.at_bound, strict=True) if is_at]
-    if at_bound:
-        joints = list(dict.fromkeys(name.rpartition(".")[0] for name in at_bound))
-        where, text = ", ".join(at_bound), listed(at_bound, _NAMED)
-        findings.append(finding("at_bound", "", joints, subject=where, names=text))
-    findings += [
-        finding("extent_contradicted", subject=f"link {body}", link=body)
-        for body in fit.estimate.details.get("relaxed", ())
-    ]
-    return findings
-
-
-def _outlier_findings(fit: Fit) -> list[Finding]:
+def _of_outliers(fit: Fit) -> Finding:
     outliers = fit.outliers
-    if not outliers:
-        return []
     places = "; ".join(
         f"{o.joint} at {o.t:.3f} s of {o.log}: measured {o.torque:.4g}, predicted "
         f"{o.predicted:.4g}, residual {o.size:.0f} times the typical one"
@@ -424,21 +375,10 @@ def _outlier_findings(fit: Fit) -> list[Finding]:
     )
     places += f"; and {len(outliers) - _NAMED} more" if len(outliers) > _NAMED else ""
     count = f"{len(outliers)} outlier{'s' if len(outliers) > 1 else ''}"
-    return [
-        finding(
-            "outliers", "", outliers[0].joint, count=count, where=places,
-            cure=fit.estimator.is_robust, places=len(outliers), largest=outliers[0].size,
-        )
-    ]  # fmt: skip
-
-
-def _asked(fit: Fit) -> str:
-    """Return the constraints that the user states, as text; empty if none."""
-    settings = fit.estimator
-    if not isinstance(settings, BoundedSettings):
-        return ""
-    asked = [key for key, value in settings.constraints.items() if value]
-    return f"the constraints in [estimator] ({listed(asked)}), " if asked else ""
+    return finding(
+        "outliers", "", outliers[0].joint, count=count, where=places,
+        cure=fit.estimator.is_robust, places=len(outliers), largest=outliers[0].size,
+    )  # fmt: skip
 
 
 def _locked_links(fit: Fit) -> str:
@@ -447,24 +387,24 @@ def _locked_links(fit: Fit) -> str:
     Such links keep the URDF's inertials: the moved link takes all their errors.
     """
     model, size = fit.model, fit.model.layout.n_inertial
-    held, found = held_parameters(model), fit.standard[:size]
+    held, identified = held_parameters(model), fit.standard[:size]
     own, before = (
         np.linalg.eigvalsh(pseudo_inertia(pi[:size] - held))[:, 0]
-        for pi in (found, model.standard_parameters())
+        for pi in (identified, model.standard_parameters())
     )
-    links = [
+    is_shrunk = (own < _SHRUNK * before) & (held[::10] > _MUCH * identified[::10])
+    return "".join(
         f"the URDF's inertials of the links on locked joints, {held[10 * k]:.3g} kg of the "
-        f"{found[10 * k]:.3g} kg of {model.layout.bodies[k]} (identify their joints, too, if they "
-        "are wrong), "
-        for k in np.flatnonzero((own < _SHRUNK * before) & (held[::10] > _MUCH * found[::10]))
-    ]
-    return "".join(links)
+        f"{identified[10 * k]:.3g} kg of {model.layout.bodies[k]} (identify their joints, too, if "
+        "they are wrong), "
+        for k in np.flatnonzero(is_shrunk)
+    )
 
 
 def _contradiction(fit: Fit) -> tuple[str, dict[str, str]]:
     """Return whether data ("costs") or masses ("vanished") contradict active bounds."""
     ours, wls = (fit.metrics(name).per_joint for name in ("estimate", "wls"))
-    costs = [joint for joint in ours if ours[joint].rmse > _COSTS * wls[joint].rmse]
+    costs = [joint for joint in ours if ours[joint].rmse > BEATEN * wls[joint].rmse]
     if costs:
         return "costs", {"costs": listed(costs)}
     layout = fit.model.layout
@@ -503,17 +443,17 @@ def unlike_findings(variation: Variation | None) -> Iterator[Finding]:
 def _unlike(code: str, name: str, unlike: UnlikeRun, others: int, rest: str) -> Finding:
     """Return the finding about a log or a unit, with the prediction of the others."""
     (low, high), kind = (float(end) for end in unlike.ends), unlike.kind
-    size, span = f"{unlike.value:.3g} +- {unlike.std_error:.2g}", f"{low:.3g} to {high:.3g}"
-    if kind == "zero":
-        size = f"{unlike.value:+.3g} +- {unlike.std_error:.2g}"
+    sign = "+" if kind == "zero" else ""
+    size = f"{unlike.value:{sign}.3g} +- {unlike.std_error:.2g}"
+    span = f"{low:.3g} to {high:.3g} {unlike.unit}"
     if kind == "gain":
         size = f"{100 * (unlike.value - 1):+.3g} +- {100 * unlike.std_error:.2g} %"
         span = f"{100 * (low - 1):+.3g} to {100 * (high - 1):+.3g} %"
     return finding(
         code, subject=name, name=name, what=kind, cure=kind, others=f"{others} {rest}", rest=rest,
         parameter=unlike.where if kind in ("zero", "gain") else unlike.name, unit=unlike.unit,
-        size=size, range=span if kind == "gain" else f"{span} {unlike.unit}", value=unlike.value,
-        std_error=unlike.std_error, low=low, high=high, probability=unlike.probability,
+        size=size, range=span, value=unlike.value, std_error=unlike.std_error, low=low, high=high,
+        probability=unlike.probability,
     )  # fmt: skip
 
 
@@ -540,7 +480,7 @@ def rescaled_findings(fit: Fit, loaded: Collection[str] = ()) -> Iterator[Findin
             tau, predicted = motion.tau[mask[:, k], k], e.torques["estimate"][mask[:, k], k]
             factor = float(predicted @ tau) / max(float(predicted @ predicted), 1e-300)
             left = float(np.sum((tau - factor * predicted) ** 2) / np.sum((tau - predicted) ** 2))
-            if abs(factor - 1.0) < _RESCALED or left > _LEFT:
+            if abs(factor - 1.0) < DIFFERS or left > _LEFT:
                 continue
             friction = friction or friction_shares(fit)
             yield finding(

@@ -9,15 +9,13 @@ import numpy as np
 
 from robotid.base.files import finite
 from robotid.base.typing import Array
+from robotid.diagnosis.decisions import CORRELATED
 from robotid.estimation.fitting.fitted import Fit, Identified
 
 #: Columns of a row: link or drive, parameter, the URDF's value, the identified one, its standard
 #: error, its 95 % interval, what determined it, unit.
 HEADERS = ("part", "parameter", "urdf", "value", "std_error", "low", "high", "source", "unit")
 _NUMBERS = HEADERS[2:7]
-#: Size of the correlation from which two parameters are strongly correlated: if one were known,
-#: the error of the other would be less than a third of what it is, sqrt(1 - r^2) = 0.31.
-CORRELATED = 0.95
 #: Mass [kg], centre of mass [m], inertia about it [kg m^2], in the axes of the joint frame.
 CENTRAL_TERMS = ("m", "cx", "cy", "cz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
 _PAIRS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))  # axes of Pinocchio's six inertias
@@ -71,8 +69,7 @@ def parameter_table(
 def _correlations(C: Array, own: Sequence[int]) -> Array:
     """Return the correlations of parameters with each other, 0 of each with itself."""
     error = np.sqrt(np.diag(C)[own])
-    R: Array = C[np.ix_(own, own)] / np.outer(error, error) - np.eye(len(own))
-    return R
+    return np.asarray(C[np.ix_(own, own)] / np.outer(error, error) - np.eye(len(own)))
 
 
 def correlated_sets(C: Array, own: Sequence[int]) -> list[list[int]]:

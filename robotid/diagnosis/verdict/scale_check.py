@@ -13,6 +13,7 @@ import scipy.special
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import sentence_of
+from robotid.diagnosis.decisions import TINY
 from robotid.dynamics.constraint_rows import loop_basis, without_forces
 from robotid.dynamics.prediction import predict
 from robotid.dynamics.torque import joint_torque_regressor
@@ -23,18 +24,15 @@ from robotid.robot.prior import assumed_masses
 
 _POSES = 300  # at which gravity is compared
 _LOADED = 0.02  # share of the largest gravity torque above which a joint is compared
-_KNOWN = 0.1  # standard error of a ratio below which it is used
 _HELD_BACK = 1.5  # residual over that of WLS beyond which the prior determines the result
 _ANOTHER = 0.35  # difference of gravity and total mass from which on they contradict the scale
-_OFF = 0.1  # a common factor of all torques is reported if it is at least so far from 1,
-_CLEARLY = 4.0  # ... if that distance is so many times the unexplained share of gravity
-_LIKE = 1e-6  # variance of a ratio beside errors of links, for joints that the same links load
+_CLEARLY = 4.0  # distance of a common factor from 1 over the share of gravity that it leaves, ...
+_BETTER = 0.5  # ... and the largest ratio of that share to the one that a payload leaves
 _TOTAL = "total mass"
-_NORMAL = 1.96  # half width of a 95 % interval in standard errors
-_BETTER = 0.5  # ... and that share is less than this times the one with a payload
 #: Relative difference up to which a mass or a gravity torque confirms the torque scale [-].
 AGREES = 0.05
-_SAME = 1e-6  # share of a claim that changes no torque, below which it is rounding
+#: Difference of a factor from 1 that is reported, and standard error of a ratio that is used [-].
+DIFFERS = 2 * AGREES
 _ABSORBS = 0.1  # share of a change of a stated mass that a link takes up to be named
 
 
@@ -78,20 +76,14 @@ class KnownMass(ABC):
 
 @dataclass(frozen=True)
 class StatedMass(KnownMass):
-    """Masses that the user states, and what torque alone determines of them.
+    """Masses that the user states, and what torque alone determines of them."""
 
-    Attributes:
-        names: What is stated: "total_mass", or "mass of" a link.
-        ratio: Mass that torque alone determines, without this statement and without the URDF's
-            masses, over the stated mass [-]; None if torque does not determine it.
-        half_width: Half-width of its 95 % interval, plus that of the stated range [-].
-        absorbed_by: Links whose masses change with the stated one while no torque changes.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # "total_mass", or "mass of" a link
+    #: Mass that torque alone determines, without this statement and without the URDF's masses, over
+    #: the stated mass [-]; None if torque does not determine it.
     ratio: float | None = None
-    half_width: float = 0.0
-    absorbed_by: tuple[str, ...] = ()
+    half_width: float = 0.0  # of its 95 % interval, plus that of the stated range [-]
+    absorbed_by: tuple[str, ...] = ()  # links that take up the mass while no torque changes
     kind: ClassVar[str] = "stated mass"
 
     @property
@@ -116,26 +108,15 @@ class StatedMass(KnownMass):
 
 @dataclass(frozen=True)
 class PayloadCheck(KnownMass):
-    """The known mass of a payload, and its mass as torque alone determines it.
+    """The known mass of a payload, and its mass as torque alone determines it."""
 
-    Attributes:
-        link: The link that carries it.
-        known: Its known mass [kg].
-        identified: Its mass identified without this knowledge [kg]; None if the motion does not
-            determine it.
-        std_error: Standard error of that [kg].
-        interval: 95 % interval of it [kg].
-        log: The log with the payload; "" if it is not a file.
-        sha256: SHA-256 of the log; "" if it is not a file.
-    """
-
-    link: str
-    known: float
-    identified: float | None = None
-    std_error: float = 0.0
-    interval: tuple[float, float] = (0.0, 0.0)
-    log: str = ""
-    sha256: str = ""
+    link: str  # the link that carries it
+    known: float  # its known mass [kg]
+    identified: float | None = None  # without this knowledge [kg]; None: not determined
+    std_error: float = 0.0  # of that [kg]
+    interval: tuple[float, float] = (0.0, 0.0)  # 95 %, of it [kg]
+    log: str = ""  # the log with the payload; "" if it is not a file
+    sha256: str = ""  # of the log
     kind: ClassVar[str] = "payload of known mass"
 
     @property
@@ -172,44 +153,32 @@ class PayloadCheck(KnownMass):
 
 @dataclass(frozen=True)
 class ScaleCheck:
-    """The identified gravity and masses against the URDF's.
+    """The identified gravity and masses against the URDF's."""
 
-    Attributes:
-        gravity: Identified over URDF's gravity torque, by joint that gravity loads [-].
-        gravity_error: Standard errors of these ratios [-].
-        scale: Ratio over all joints together, fitted with a payload; None if gravity loads none.
-        factor: Ratio over all joints together, without a payload [-].
-        unexplained: Share of the identified gravity torque that remains unexplained by one factor,
-            and by a payload [-].
-        masses: Total mass of the URDF, identified total mass, mass of that payload [kg].
-        stated: The masses that the user states, and what torque alone determines of them; None if
-            none is stated.
-        payloads: The checks with payloads of known mass, that with the narrowest interval first.
-        is_total_determined: Whether torque alone determines the total mass within 5 %, so that a
-            measured one verifies the scale.
-        friction: Share of viscous and Coulomb friction in each joint's torque [-].
-        follows: Whether the result fits the data about as well as WLS. A result that its prior
-            determines agrees with the URDF whatever the sensors measured.
-        common: Factor common to the ratios of the joints, and half the width of its 95 % interval
-            [-], as errors of the URDF spread the ratios; None with fewer than two.
-        mass_error: Standard error of the identified total mass [kg].
-        assumed: Number of links whose inertials are assumed, so that gravity and mass of the URDF
-            are no evidence.
-    """
-
+    #: Identified over URDF's gravity torque, by joint that gravity loads [-], and standard errors.
     gravity: Mapping[str, float] = field(default_factory=dict)
     gravity_error: Mapping[str, float] = field(default_factory=dict)
-    scale: float | None = None
-    factor: float = 1.0
+    scale: float | None = None  # over all joints, fitted with a payload [-]; None: no gravity
+    factor: float = 1.0  # over all joints together, without a payload [-]
+    #: Share of the identified gravity torque that one factor, and a payload, leave unexplained [-].
     unexplained: tuple[float, float] = (0.0, 0.0)
+    #: Total mass of the URDF, identified total mass, mass of that payload [kg].
     masses: tuple[float, float, float] = (0.0, 0.0, 0.0)
     stated: StatedMass | None = None
-    payloads: tuple[PayloadCheck, ...] = ()
+    payloads: tuple[PayloadCheck, ...] = ()  # that with the narrowest interval first
+    #: Whether torque alone determines the total mass within 5 %, so that a measured one verifies
+    #: the scale.
     is_total_determined: bool = False
-    friction: Mapping[str, float] = field(default_factory=dict)
+    friction: Mapping[str, float] = field(default_factory=dict)  # its share of each torque [-]
+    #: Whether the result fits the data about as well as WLS. A result that its prior determines
+    #: agrees with the URDF whatever the sensors measured.
     follows: bool = True
+    #: Factor common to the ratios of the joints, and half the width of its 95 % interval [-], as
+    #: errors of the URDF spread the ratios; None with fewer than two.
     common: tuple[float, float] | None = None
-    mass_error: float = 0.0
+    mass_error: float = 0.0  # standard error of the identified total mass [kg]
+    #: Number of links whose inertials are assumed, so that gravity and mass of the URDF are no
+    #: evidence.
     assumed: int = 0
 
     @property
@@ -217,7 +186,7 @@ class ScaleCheck:
         """Whether known masses, or else gravity and total mass of the URDF, confirm the scale."""
         if self._decisive:
             return all(check.verifies for check in self._decisive)
-        return self.scale is not None and self._off <= AGREES and self.follows
+        return self.scale is not None and self._off() <= AGREES and self.follows
 
     @property
     def contradicts(self) -> bool:
@@ -228,18 +197,15 @@ class ScaleCheck:
         """
         if self._decisive:
             return any(check.contradicts for check in self._decisive)
-        return self.has_one_factor or self._is_far
-
-    @property
-    def _is_far(self) -> bool:
-        """Whether gravity or a determined total mass differs by more than errors of the URDF."""
         before, after, payload = self.masses
-        has_mass = abs(after - before) > _NORMAL * self.mass_error
+        has_mass = abs(after - before) > QUANTILE * self.mass_error
+        if self.has_one_factor:
+            return True
         if self._is_urdf:  # gravity is no evidence, a total mass that is determined is
             least = min(abs(after - before), abs(after - payload - before))
             return has_mass and not self._is_total_open and least > _ANOTHER * before
         is_any = self._ratios_whole if has_mass else self.scale is not None
-        return bool(is_any) and self._off_by(has_mass=has_mass) > _ANOTHER
+        return bool(is_any) and self._off(has_mass=has_mass) > _ANOTHER
 
     @property
     def _is_urdf(self) -> bool:
@@ -260,7 +226,7 @@ class ScaleCheck:
         """Whether one common factor explains gravity: the scale is wrong, not single masses."""
         by_factor, by_payload = self.unexplained
         return (
-            abs(self.factor - 1.0) > max(_OFF, _CLEARLY * by_factor)
+            abs(self.factor - 1.0) > max(DIFFERS, _CLEARLY * by_factor)
             and by_factor < _BETTER * by_payload
             and not self._is_urdf
         )
@@ -296,7 +262,7 @@ class ScaleCheck:
         """How gravity and total mass confirm the scale."""
         before, after, payload = self.masses
         return sentence_of(
-            "scale:agrees", what=self._is_total_open, load=self._off_whole > AGREES,
+            "scale:agrees", what=self._is_total_open, load=self._off_whole() > AGREES,
             payload=payload, scale=self.scale or 0.0, rest=after - payload, before=before,
             figures=self.figures,
         )  # fmt: skip
@@ -304,7 +270,7 @@ class ScaleCheck:
     @property
     def _doubt(self) -> str:
         """Which figures exceed which limit, and the probable cause."""
-        limit = _ANOTHER if self._off > _ANOTHER else AGREES
+        limit = _ANOTHER if self._off() > _ANOTHER else AGREES
         beyond = [x for x, ratio in self._ratios_whole.items() if abs(ratio - 1.0) > limit]
         compared = {} if self.assumed else self.gravity
         single = [f"{j} {x:.2f}" for j, x in compared.items() if abs(x - 1.0) > _ANOTHER]
@@ -341,19 +307,13 @@ class ScaleCheck:
         mass = {} if is_open else {_TOTAL: after / before if before > 0 else np.inf}
         return ({} if self.scale is None else {"gravity torque": self.factor}) | mass
 
-    @property
-    def _off(self) -> float:
-        """Relative difference of gravity and total mass, less a payload if it explains them [-]."""
-        return self._off_by(has_mass=True)
-
-    def _off_by(self, *, has_mass: bool) -> float:
-        """Return the relative difference, less a payload if it explains it [-].
+    def _off(self, *, has_mass: bool = True) -> float:
+        """Return the difference of gravity and total mass, less a payload if it explains it [-].
 
         A payload without mass is ignored: it does not determine the scale.
         """
         before, after, payload = self.masses
-        ratios = {k: x for k, x in self._ratios_whole.items() if has_mass or k != _TOTAL}
-        whole = max((abs(ratio - 1.0) for ratio in ratios.values()), default=np.inf)
+        whole = self._off_whole(has_mass=has_mass)
         if not (before > 0 and payload > 0):
             return whole
         with_load = abs((self.scale or 1.0) - 1.0)
@@ -361,10 +321,10 @@ class ScaleCheck:
             with_load = max(with_load, abs((after - payload) / before - 1.0))
         return min(with_load, whole)
 
-    @property
-    def _off_whole(self) -> float:
-        """Relative difference of gravity and total mass without a payload [-]."""
-        return max((abs(ratio - 1.0) for ratio in self._ratios_whole.values()), default=np.inf)
+    def _off_whole(self, *, has_mass: bool = True) -> float:
+        """Return the relative difference of gravity and total mass without a payload [-]."""
+        ratios = (x for key, x in self._ratios_whole.items() if has_mass or key != _TOTAL)
+        return max((abs(ratio - 1.0) for ratio in ratios), default=np.inf)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures as result.json has them."""
@@ -388,28 +348,26 @@ def check_scale(found: Fit) -> ScaleCheck:
     """
     model, size = found.model, found.model.layout.n_inertial
     before, after = (float(pi[:size:10].sum()) for pi in (found.prior, found.standard))
-    friction = friction_shares(found)
     errors = [found.metrics(name).per_joint for name in ("estimate", "wls")]
     follows = all(
         errors[0][j].rmse <= _HELD_BACK * free.rmse or j in found.overfitted
         for j, free in errors[1].items()
     )
     plain = ScaleCheck(
-        masses=(before, after, 0.0), stated=stated_mass(found), friction=friction, follows=follows,
-        is_total_determined=determines_total_mass(found),
+        masses=(before, after, 0.0), stated=stated_mass(found), friction=friction_shares(found),
+        follows=follows, is_total_determined=determines_total_mass(found),
     )  # fmt: skip
-    q = np.vstack([e.recording.trajectory.q for e in found.fitted])
     if model.free_flyer:  # gravity loads its base with the whole mass
         ratio = after / before if before > 0 else 1.0
         return replace(plain, scale=ratio, factor=ratio, is_total_determined=True)
+    q = np.vstack([e.recording.trajectory.q for e in found.fitted])
     q = q[:: -(-len(q) // _POSES)]
     still = np.zeros_like(q)
     G = joint_torque_regressor(model, q, still, still).reshape(len(q), model.n_rows, -1)
     if model.loops:
         G = without_forces(loop_basis(model, q), G)
     last = G[:, :, size - 10 : size - 6]  # m, mcx, mcy, mcz of the last body
-    by_body = G[:, :, :size]
-    G = G[:, :, found.mapping.independent]
+    by_body, G = G[:, :, :size], G[:, :, found.mapping.independent]
     at_rest = np.arange(len(found.prior)) < size
     of_urdf, of_result = (
         G @ found.mapping.to_base(np.where(at_rest, pi, 0.0))
@@ -424,24 +382,28 @@ def check_scale(found: Fit) -> ScaleCheck:
     for j in np.flatnonzero(load > _LOADED**2 * load.max()).tolist():
         w = of_urdf[:, j] @ G[:, j] / load[j]  # (b,), ratio = w beta
         spread = float(np.sqrt(max(w @ covariance @ w, 0.0)))
-        if spread < _KNOWN:
+        if spread < DIFFERS:
             gravity[model.row_names[j]] = float(of_urdf[:, j] @ of_result[:, j] / load[j])
             error[model.row_names[j]] = spread
             known.append(j)
+    plain = replace(plain, gravity=gravity, gravity_error=error)
+    of_assumed = found.prior[:size:10][np.isin(model.layout.bodies, assumed_masses(model))]
+    if of_assumed.sum() > AGREES * before:
+        return replace(plain, assumed=len(of_assumed))
     common = None
     if len(known) > 1:
         A = np.einsum("nj,njk->jk", of_urdf[:, known], by_body[:, known]) / load[known, None]
         common = common_factor(np.array([*gravity.values()]), A, found.prior[:size])
     factor = float(np.sum(of_urdf * of_result) / load.sum())
-    scale, payload, left = _with_payload(of_urdf, of_result, last)
-    rest = float(np.linalg.norm(of_result - factor * of_urdf) / np.linalg.norm(of_result))
-    plain = replace(plain, gravity=gravity, gravity_error=error)
-    of_assumed = found.prior[:size:10][np.isin(model.layout.bodies, assumed_masses(model))]
-    if of_assumed.sum() > AGREES * before:
-        return replace(plain, assumed=len(of_assumed))
+    P, u, g = last.reshape(-1, 4), of_urdf.reshape(-1), of_result.reshape(-1)
+    alone = np.linalg.lstsq(P, g - u)[0]  # (4,), a payload
+    rest = [
+        float(np.linalg.norm(x) / np.linalg.norm(g)) for x in (g - factor * u, g - u - P @ alone)
+    ]
+    scale, payload, *_ = np.linalg.lstsq(np.column_stack([u, P]), g)[0].tolist()
     return replace(
-        plain, scale=scale, factor=factor,
-        unexplained=(rest, left), masses=(before, after, payload), common=common,
+        plain, scale=scale, factor=factor, unexplained=(rest[0], rest[1]), common=common,
+        masses=(before, after, max(payload, 0.0)),
         mass_error=float(np.sqrt(max(found.standard_covariance[:size:10, :size:10].sum(), 0.0))),
     )  # fmt: skip
 
@@ -456,15 +418,11 @@ def common_factor(ratios: Array, sensitivity: Array, inertial: Array) -> tuple[f
     interval. Errors of the data spread the ratios, too, and are included so.
     """
     A, pi = sensitivity.reshape(len(ratios), -1, 10), inertial.reshape(-1, 10)
-    J = pseudo_inertia(inertial)
+    second = np.trace(pseudo_inertia(inertial)[:, :3, :3], axis1=1, axis2=2)
     # mass times radius of gyration
-    moment = np.sqrt(
-        np.maximum(
-            pi[:, 0] * np.trace(J[:, :3, :3], axis1=1, axis2=2) - np.sum(pi[:, 1:4] ** 2, 1), 0
-        )
-    )
+    moment = np.sqrt(np.maximum(pi[:, 0] * second - np.sum(pi[:, 1:4] ** 2, axis=1), 0.0))
     E = np.column_stack([np.einsum("kbp,bp->kb", A, pi), *(A[:, :, i] * moment for i in (1, 2, 3))])
-    L = np.linalg.cholesky(E @ E.T + _LIKE * np.eye(len(ratios)))
+    L = np.linalg.cholesky(E @ E.T + TINY * np.eye(len(ratios)))
     one, r = np.linalg.solve(L, np.column_stack([np.ones(len(ratios)), ratios])).T
     factor = float(one @ r / (one @ one))
     free = len(ratios) - 1
@@ -483,15 +441,6 @@ def friction_shares(found: Fit) -> dict[str, float]:
     torque, measured = np.linalg.norm([torque, measured], axis=1)
     share = np.divide(torque, measured, where=measured > 0.0, out=np.zeros_like(torque))
     return dict(zip(found.model.row_names, share.tolist(), strict=True))
-
-
-def _with_payload(of_urdf: Array, of_result: Array, last: Array) -> tuple[float, float, float]:
-    """Return scale and mass of a payload, and the share that a payload alone leaves unexplained."""
-    P, u, g = last.reshape(-1, 4), of_urdf.reshape(-1), of_result.reshape(-1)
-    alone = np.linalg.lstsq(P, g - u)[0]
-    left = float(np.linalg.norm(g - u - P @ alone) / np.linalg.norm(g))
-    both = np.linalg.lstsq(np.column_stack([u, P]), g)[0]
-    return float(both[0]), max(float(both[1]), 0.0), left
 
 
 def stated_mass(found: Fit) -> StatedMass | None:
@@ -545,9 +494,9 @@ def _checked(found: Fit, names: Sequence[str], C: Array, widths: Array) -> State
     free = claims - claims @ inverse @ (K * spread)  # (k, p), changes no torque
     U, size, _ = np.linalg.svd(free)
     size = np.append(size, np.zeros(len(U) - len(size)))
-    Z = U[:, size <= _SAME * np.linalg.norm(claims)]  # (k, d)
+    Z = U[:, size <= TINY * np.linalg.norm(claims)]  # (k, d)
     o = Z.sum(axis=0)
-    if not np.linalg.norm(o) > _SAME:
+    if not np.linalg.norm(o) > TINY:
         change = np.abs(free.sum(axis=0) * spread)[: model.layout.n_inertial : 10]
         shares = change / change.sum()
         links = [x for x, part in zip(model.layout.bodies, shares, strict=True) if part > _ABSORBS]

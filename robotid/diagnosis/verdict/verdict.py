@@ -1,38 +1,59 @@
 """Verdict on a result, with reasons; what was not tested is never "good"."""
 
-import difflib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from robotid.base.findings import listed, quoted
+from robotid.diagnosis.catalogue import sentence_of
+from robotid.estimation.fitting.evaluation import JointMetrics, Metrics
+
+if TYPE_CHECKING:
+    from robotid.diagnosis.verdict.scale_check import ScaleCheck
+
+import difflib
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, replace
+from typing import Any
+
 from robotid.base.exceptions import SettingsError
-from robotid.base.findings import Finding, listed, not_ignored
+from robotid.base.findings import Finding, not_ignored
 from robotid.base.settings import require_kind
 from robotid.diagnosis.catalogue import codes_with, reason_of
-from robotid.diagnosis.verdict.evidence import (
-    COSTLY,
-    Determined,
-    JointEvidence,
-    Predictions,
-    error_of,
-    is_harmless_cost,
-    uses_of_torques,
-)
 from robotid.diagnosis.verdict.scale_check import ScaleCheck
-from robotid.estimation.fitting.evaluation import Metrics, logs_that_test
+from robotid.estimation.fitting.evaluation import logs_that_test
 
-_REJECTED = 5.0  # [%] a smaller prediction error rejects a hypothesis on columns or masses
-_SCALED = 2.0  # a gravity torque within this factor of the URDF's contradicts a wrong unit
-_SMALL = 5.0  # [%] of the torque: a missing drive term below this gives no warning
-_HYPOTHESES = (
-    "current_for_torque",
-    "gravity",
-    "gravity_compensated",
-    "unexplained_torque",
-    "urdf_mismatch",
-)
+#: [%] largest torque prediction error on validation logs of a joint that is "good".
+GOOD = 15.0
+#: [%] a joint with a larger torque prediction error is not usable.
+POOR = 50.0
+#: [%] the same limits of simulated position errors.
+GOOD_POSITION, POOR_POSITION = 5.0, 30.0
+#: Error over that of the second-order model from which it is hardly smaller: half the squares.
+HARDLY = 0.7
+#: A simpler model is better if its error is smaller by this factor ...
+BEATEN = 1.05
+_TIE = 0.3  # [%] ... and, for the URDF with fitted drives, by this share of the torque
+#: [%] a larger error on the fitted logs, twice that of WLS, makes a joint poor.
+COSTLY = 3.0
+#: [%] of the torque: a smaller prediction error rejects a hypothesis on columns or masses, and
+#: gives no warning of a missing drive term.
+SMALL = 5.0
+_HARMLESS = 1.0  # [%] of the torque, below which an error gives no warning
+_MUCH = 2.0  # ratio of two errors, or of two gravity torques, that is no chance
+_BASE = "base."  # of the rows of a floating base
+_NAMED = 8  # parameters that a reason names
+_USES_NAMED = 3  # joints that the line names
+_NOT_VERIFIED = "not verified, no validation log"
+_UNSCALED = "torque scale not verified"
+_HYPOTHESES = ("current_for_torque", "gravity", "gravity_compensated", "unexplained_torque",
+               "urdf_mismatch")  # fmt: skip
 _STATIC = (
     "static model: gravity, offsets and Coulomb friction were identified. Inertias, armature and "
     "viscous friction keep the URDF's values: the result is valid at rest and for slow motion"
@@ -40,57 +61,308 @@ _STATIC = (
 _HIDDEN = "gravity changes its torque less than friction does at rest"
 # places that are not a recording
 _OF_THE_FIT = ("all joints", "estimator", "recordings", "standard_parameters")
+#: Simpler models, by name of the baseline; "urdf" has fitted drives where torques are the input.
+_SIMPLER = {
+    "command": "the command itself",
+    "second_order": "a second-order model",
+    "urdf": "the URDF with the stated gains",
+    "rows": "the fit to torques alone",
+    "steady": "constant velocity from the start",
+}
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Torque prediction errors of each joint."""
+
+    fit: Metrics  # over the fitted recordings
+    validation: Mapping[str, Metrics]  # by validation log, or by log left out in turn
+    #: The model's joints; one without a sample in any recording is not evaluated.
+    joints: Sequence[str] = ()
+    refitted: Sequence[str] = ()  # validation logs left out because they contain fitted samples
+    hidden: Sequence[str] = ()  # joints not evaluated, of ``hidden_joints``; without metrics
+
+    @cached_property
+    def fitted(self) -> dict[str, JointMetrics]:
+        """Metrics of each joint over the fitted recordings."""
+        return self._evaluated(self.fit)
+
+    @cached_property
+    def tested(self) -> dict[str, dict[str, JointMetrics]]:
+        """Metrics of each joint on each validation log."""
+        return {log: self._evaluated(metrics) for log, metrics in self.validation.items()}
+
+    def _evaluated(self, metrics: Metrics) -> dict[str, JointMetrics]:
+        """Return the metrics of joints; those of a floating base if no joint has any."""
+        found = {joint: m for joint, m in metrics.per_joint.items() if joint not in self.hidden}
+        joints = {name: m for name, m in found.items() if not name.startswith(_BASE)}
+        return joints or found
+
+    def of_base(self) -> list[str]:
+        """Return the prediction errors of the wrench on a floating base, beside its joints'."""
+        notes = []
+        for log, metrics in self.validation.items():
+            own = {x: m for x, m in metrics.per_joint.items() if x.startswith(_BASE)}
+            if not own or own.keys() & self.tested[log].keys():
+                continue
+            errors = [f"{x.removeprefix(_BASE)} {error_of(m):.0f} %" for x, m in own.items()]
+            notes.append(sentence_of("verdict:base", log=log, errors=listed(errors)))
+        return notes
+
+    def on_each(self) -> dict[str, JointEvidence]:
+        """Return the evidence for each joint."""
+        moved = [joint for m in (self.fitted, *self.tested.values()) for joint in m]
+        named = [joint for joint in self.joints if joint not in self.hidden]
+        every = {joint: JointEvidence() for joint in dict.fromkeys([*named, *moved])}
+        for log, metrics in self.tested.items():
+            for joint, measured in metrics.items():
+                _judge_joint(every[joint], joint, log, measured, self.fitted.get(joint))
+                every[joint].errors.append(error_of(measured))
+        return every
+
+    def untested(self) -> list[str]:
+        """Return why no prediction of unseen motion was evaluated; empty if one was."""
+        if self.validation:
+            return []
+        what = "refitted" if self.refitted else "none"
+        return [sentence_of("verdict:untested", what=what, logs=listed(self.refitted))]
+
+    def better_by_urdf(self, rescaled: Collection[str] = ()) -> list[str]:
+        """Return the joints that the URDF with fitted drives predicts better, and the remedy."""
+        worse = [j for own in self.tested.values() for j, m in own.items() if is_beaten(m)]
+        worse = [joint for joint in worse if joint not in rescaled]
+        joints = listed(dict.fromkeys(worse))
+        return [sentence_of("verdict:urdf", joints=joints)] if worse else []
+
+    def at_rest(self) -> list[str]:
+        """Return the joints at rest in all recordings, and those at rest in all validation logs."""
+        fitted, validated = self.fitted, {joint for own in self.tested.values() for joint in own}
+        names = [joint for joint in self.on_each() if joint not in validated]
+        still = [joint for joint in names if joint not in fitted]
+        missing = [joint for joint in names if joint in fitted]
+        if still and not fitted:  # evaluated again without the fitted recordings
+            still, missing = [], still
+        named = {"recording": still, "validation log": missing if self.validation else []}
+        return [
+            sentence_of("verdict:rest", joints=listed(names), logs=logs)
+            for logs, names in named.items()
+            if names
+        ]
+
+    def why_untested(self, joint: str) -> str:
+        """Return why a joint was evaluated on no validation log."""
+        if joint not in self.fitted:
+            return "it does not move in any recording"
+        if self.validation:
+            return "it does not move in any validation log"
+        return "no validation log given"
+
+
+@dataclass(frozen=True)
+class JointEvidence:
+    """Why a joint is poor, the worst kind of reason first; cautions; errors by log [%]."""
+
+    poor: list[tuple[int, str]] = field(default_factory=list)
+    cautions: list[str] = field(default_factory=list)
+    errors: list[float] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Determined:
+    """Parameters that the data determine."""
+
+    undetermined: Sequence[str] = ()  # base parameters that are not determined individually
+    is_consistent: bool = True  # whether the parameters are physically consistent
+    is_poorly_excited: bool = True  # whether a richer motion would determine them; else noise
+    is_static: bool = False
+    #: Other drive parameters whose standard error is not smaller than 0.9 of their prior standard
+    #: deviation.
+    uncertain_drives: Sequence[str] = ()
+
+    def warnings(self) -> list[str]:
+        """Return the reasons why the result is at best usable."""
+        is_open = bool(self.undetermined) and self.is_poorly_excited
+        holds = {"open": is_open, "inconsistent": not self.is_consistent}
+        return [self._sentence(what, self.undetermined) for what, is_so in holds.items() if is_so]
+
+    def notes(self) -> list[str]:
+        """Return notes that do not change the verdict: parameters hidden by the noise."""
+        hidden = () if self.is_poorly_excited else self.undetermined
+        named = {"hidden": hidden, "drives": self.uncertain_drives}
+        return [self._sentence(what, names) for what, names in named.items() if names]
+
+    @staticmethod
+    def _sentence(what: str, names: Sequence[str]) -> str:
+        named = listed(names, _NAMED)
+        return sentence_of("verdict:determined", what=what, count=len(names), names=named)
+
+
+def is_beaten(measured: JointMetrics) -> bool:
+    """Return whether the URDF with fitted drives predicts a joint clearly better."""
+    driven = measured.baselines.get("urdf_with_drives")
+    return driven is not None and error_of(measured) > max(BEATEN * driven, driven + _TIE)
+
+
+def is_harmless_cost(error: float, wls_error: float) -> bool:
+    """Return whether constraints cost so little torque error that the verdict does not count it."""
+    return error < max(_MUCH * wls_error, _HARMLESS)
+
+
+def error_of(measured: JointMetrics) -> float:
+    """Return the relative error of a joint [%], inf where nothing was measured."""
+    value = measured.relative_error_pct
+    return float("inf") if value is None else value
+
+
+def _judge_joint(
+    evidence: JointEvidence,
+    joint: str,
+    log: str,
+    measured: JointMetrics,
+    fitted: JointMetrics | None,
+) -> None:
+    """Add the first reason that one log gives: rank 0 is worse than a constant, 1 than the URDF."""
+    error, urdf = error_of(measured), measured.baselines.get("urdf")
+    urdf = np.inf if urdf is None else urdf
+    before = 0.0 if fitted is None else error_of(fitted)
+    is_flat = not measured.better_than_constant and not joint.startswith(_BASE)  # no weight alone
+    kinds = {
+        "zero": (2, measured.relative_error_pct is None),
+        "constant": (0, is_flat),
+        "urdf": (1, error > urdf),
+        "poor": (2, error > POOR),
+        "usable": (None, error > GOOD),
+        "optimistic": (None, fitted is not None and error > max(_MUCH * before, SMALL)),
+        "beaten": (None, is_beaten(measured)),
+    }
+    what, rank = next(((x, rank) for x, (rank, holds) in kinds.items() if holds), ("", None))
+    if not what:
+        return
+    driven = measured.baselines.get("urdf_with_drives") or 0.0
+    constant = error / np.sqrt(1.0 - measured.r2) if what == "constant" else 0.0
+    text = sentence_of(
+        "verdict:joint", what=what, subject_of=joint, on=log, error=error, urdf=urdf, fit=before,
+        quoted=quoted(joint), driven=driven, constant=constant,
+        poor=POOR, good=GOOD,
+    )  # fmt: skip
+    if rank is None:
+        evidence.cautions.append(text)
+    else:
+        evidence.poor.append((rank, text))
+
+
+def uses_of_torques(
+    joints: Mapping[str, str],
+    *,
+    is_consistent: bool,
+    is_static: bool,
+    log_errors: Sequence[str],
+    scale_check: ScaleCheck | None,
+) -> dict[str, str]:
+    """Return what a result with predicted torques can be used for: "yes" or "no", and why.
+
+    Torque feed-forward needs the predicted torque of its joints. Inertials in a simulation need
+    physical consistency and the torque scale, too. The mass of a payload is that of the gravity
+    torque: it needs the joints that gravity loads, and the torque scale.
+    """
+    predicted = _predicted(joints)
+    loaded = (
+        {} if scale_check is None else {j: s for j, s in joints.items() if j in scale_check.gravity}
+    )
+    if log_errors:
+        predicted = inertials = payload = "no, errors of the recordings"
+    elif scale_check is not None and scale_check.contradicts:
+        inertials = payload = "no, the torque scale is contradicted"
+    else:
+        is_scaled = scale_check is not None and scale_check.agrees
+        inertials = predicted if is_scaled else _with(predicted, _UNSCALED)
+        payload = _predicted(loaded) if loaded else "no, no joint determines its gravity"
+        payload = payload if is_scaled else _with(payload, _UNSCALED)
+        if not is_consistent:
+            inertials = "no, not physically consistent"
+        elif "poor" in joints.values():
+            inertials = f"no, torques of {_named(joints, 'poor')} are poor"
+    if is_static:
+        predicted = _with(predicted, "at rest and in slow motion")
+        inertials = "no, inertias are the URDF's" if inertials.startswith("yes") else inertials
+    return {
+        "torque feed-forward": predicted,
+        "inertials in simulation": inertials,
+        "payload estimation": payload,
+    }
+
+
+def uses_of_motion(
+    joints: Mapping[str, str], *, log_errors: Sequence[str], is_scaled: bool
+) -> dict[str, str]:
+    """Return what a result with simulated positions can be used for: "yes" or "no", and why."""
+    simulated = "no, errors of the recordings" if log_errors else _predicted(joints)
+    torque = simulated if is_scaled else _with(simulated, "scale not verified by a torque")
+    return {
+        "simulation of drives and controllers": simulated,
+        "torque feed-forward": torque,
+        "payload estimation": "no, it needs a result from logged torques",
+    }
+
+
+def uses_line(uses: Mapping[str, str]) -> str:
+    """Return the uses as one line of text; "" if there are none."""
+    return f"use for: {'; '.join(f'{what}: {is_so}' for what, is_so in uses.items())}" * bool(uses)
+
+
+def _predicted(joints: Mapping[str, str]) -> str:
+    """Return whether the predictions of joints can be used."""
+    tested = {joint: status for joint, status in joints.items() if status != "not evaluated"}
+    if not tested:
+        return _NOT_VERIFIED
+    poor = [joint for joint, status in tested.items() if status == "poor"]
+    if len(poor) == len(tested):
+        return "no, the errors on validation logs are large"
+    if poor:
+        return f"yes, without {_named(joints, 'poor')}"
+    if len(tested) < len(joints):
+        return f"yes, without {_named(joints, 'not evaluated')} (not evaluated)"
+    return "yes, with the warnings" if "usable" in tested.values() else "yes"
+
+
+def _named(joints: Mapping[str, str], status: str) -> str:
+    """Return the joints with a status, as part of a sentence."""
+    return listed([joint for joint, found in joints.items() if found == status], _USES_NAMED)
+
+
+def _with(use: str, condition: str) -> str:
+    """Return a use under a condition; a "no" remains."""
+    return f"{use}, {condition}" if use.startswith("yes") else use
 
 
 @dataclass(frozen=True)
 class VerdictWarning:
-    """Reason why a result may be wrong although it predicts torque well.
+    """Reason why a result may be wrong although it predicts torque well."""
 
-    Attributes:
-        code: Code of the finding.
-        joint: The joint concerned; empty if the whole result is.
-        message: The reason as text.
-        effect: The best verdict on the joint with this warning: "usable" or "poor".
-    """
-
-    code: str
-    joint: str
+    code: str  # of the finding
+    joint: str  # empty if the whole result is concerned
     message: str
-    effect: str = "usable"
+    effect: str = "usable"  # the best verdict on the joint with this warning: or "poor"
 
 
 @dataclass(frozen=True)
 class JointVerdict:
-    """Verdict on the torque prediction of one joint.
+    """Verdict on the torque prediction of one joint."""
 
-    Attributes:
-        status: "good", "usable", "poor" or "not evaluated".
-        reasons: Why, the worst first; for "good" what was checked.
-    """
-
-    status: str
-    reasons: tuple[str, ...]
+    status: str  # "good", "usable", "poor" or "not evaluated"
+    reasons: tuple[str, ...]  # the worst first; for "good" what was checked
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Verdict on a result.
+    """Verdict on a result."""
 
-    Attributes:
-        status: "good", "usable", "poor" or "not evaluated".
-        reasons: Why, the worst first; for "good" what was checked.
-        joints: The verdict on each joint of the model.
-        log_errors: Faults of the recordings.
-        warnings: Warnings of the doctor and of the fit.
-        use_for: Whether the result can be used for a purpose, "yes" or "no" and why, by purpose.
-    """
-
-    status: str
-    reasons: tuple[str, ...]
+    status: str  # "good", "usable", "poor" or "not evaluated"
+    reasons: tuple[str, ...]  # the worst first; for "good" what was checked
     joints: Mapping[str, JointVerdict] = field(default_factory=dict)
-    log_errors: tuple[str, ...] = ()
-    warnings: tuple[VerdictWarning, ...] = ()
-    use_for: Mapping[str, str] = field(default_factory=dict)
+    log_errors: tuple[str, ...] = ()  # faults of the recordings
+    warnings: tuple[VerdictWarning, ...] = ()  # of the doctor and of the fit
+    use_for: Mapping[str, str] = field(default_factory=dict)  # "yes" or "no" and why, by purpose
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict as plain values, as result.json has it."""
@@ -270,16 +542,14 @@ def rejected(
     for one in findings:
         joints = [joint for joint in one.joints if joint in errors] or [*errors]
         worst = max((errors[joint] for joint in joints), default=np.inf)
-        is_rejected = one.code in _HYPOTHESES and worst < _REJECTED
+        is_rejected = one.code in _HYPOTHESES and worst < SMALL
         if one.where == "all joints":
             is_rejected = False  # it was found in the residual of the prediction
         elif one.code == "current_for_torque":
             ratios = [scale_check.gravity[j] for j in joints if j in scale_check.gravity]
-            is_rejected &= all(1 / _SCALED < ratio < _SCALED for ratio in ratios)
+            is_rejected &= all(1 / _MUCH < ratio < _MUCH for ratio in ratios)
         elif one.code == "gravity_compensated":
-            is_rejected &= (
-                scale_check.scale is not None and 1 / _SCALED < scale_check.factor < _SCALED
-            )
+            is_rejected &= scale_check.scale is not None and 1 / _MUCH < scale_check.factor < _MUCH
         elif one.severity == "error":
             is_rejected = False
         if is_rejected:
@@ -348,7 +618,78 @@ def _warnings(finding: Finding, joints: Sequence[str]) -> Iterator[VerdictWarnin
 def _is_harmless(finding: Finding) -> bool:
     """Return whether the torque error is small in spite of a constraint or a missing term."""
     if finding.code in codes_with("term"):
-        return finding.evidence["error_pct"] < _SMALL and "replaces" not in finding.evidence
+        return finding.evidence["error_pct"] < SMALL and "replaces" not in finding.evidence
     if finding.code != "constraint_costs":
         return False
     return is_harmless_cost(finding.evidence["error_pct"], finding.evidence["wls_error_pct"])
+
+
+def judge_positions(
+    metrics: Metrics,
+    joints: Sequence[str],
+    *,
+    fitted: Metrics | None = None,
+    is_validation: bool,
+    is_settled: bool = True,
+    log_errors: Sequence[str] = (),
+    cautions: Sequence[str] = (),
+    scale: str = "",
+    knows_torques: bool = False,
+) -> Verdict:
+    """Return the verdict on simulated positions."""
+    measured, of_fit = metrics.per_joint, {} if fitted is None else fitted.per_joint
+    verdicts = {
+        j: _judge_position(j, measured.get(j), of_fit.get(j), is_validation) for j in joints
+    }
+    errors = {joint: error_of(m) for joint, m in measured.items()}
+    worst_first = sorted(verdicts, key=lambda joint: -errors.get(joint, 0.0))
+
+    def reasons(status: str) -> list[str]:
+        stated = (verdicts[joint] for joint in worst_first)
+        return [why for verdict in stated if verdict.status == status for why in verdict.reasons]
+
+    unseen = "prediction of unseen motion not evaluated: no validation log given"
+    warnings = [*cautions, *([] if is_validation else [unseen])]
+    warnings += [] if is_settled else ["the fit has not converged"]
+    verdict = concluded(
+        verdicts,
+        poor=reasons("poor"),
+        warnings=[*warnings, *reasons("not evaluated"), *reasons("usable")],
+        good="simulated position error on validation logs: at most "
+        f"{max(errors.values(), default=0.0):.2g} % of each joint's RMS motion, smaller than those "
+        "of simpler models",
+        notes=[scale] if scale else [],
+        log_errors=log_errors,
+        is_tested=is_validation and bool(measured),
+    )
+    status = {joint: verdict.status for joint, verdict in verdicts.items() if joint in measured}
+    uses = uses_of_motion(status, log_errors=log_errors, is_scaled=knows_torques)
+    return replace(verdict, use_for=uses)
+
+
+def _judge_position(
+    joint: str, measured: JointMetrics | None, fitted: JointMetrics | None, is_validation: bool
+) -> JointVerdict:
+    """Return the verdict on one joint; metrics are None if no log commands it to move."""
+    simple = None if fitted is None else fitted.baselines.get("second_order")
+    if fitted is not None and simple is not None:
+        error = error_of(fitted)
+        if error > max(GOOD, HARDLY * simple):
+            lacking = (
+                f"{joint}: simulated position error {error:.2g} % of its RMS motion on the fitted "
+                f"logs, {simple:.2g} % with a second-order model: the model lacks an effect of "
+                "this joint, such as a torque limit"
+            )
+            return on_joint([lacking], [], is_tested=is_validation, checked=lacking)
+    if measured is None:
+        still = f"{joint}: commanded to rest in all logs: not evaluated"
+        return on_joint([], [], is_tested=False, checked=still)
+    error, baselines = error_of(measured), measured.baselines
+    simpler = {key: other for key, other in baselines.items() if other is not None}
+    beaten = [key for key in _SIMPLER if error > BEATEN * simpler.get(key, math.inf)]
+    words = _SIMPLER | ({"urdf": "the URDF with fitted drives"} if "steady" in baselines else {})
+    text = f"{joint}: simulated position error {error:.2g} % of its RMS motion"
+    text += f"; smaller with {listed(words[key] for key in beaten)}" * bool(beaten)
+    is_poor = is_validation and (error > POOR_POSITION or "command" in beaten)
+    is_usable = is_validation and not is_poor and (error > GOOD_POSITION or bool(beaten))
+    return on_joint([text] * is_poor, [text] * is_usable, is_tested=is_validation, checked=text)

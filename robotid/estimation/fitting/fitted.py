@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robotid.base.arguments import real_numbers
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.settings import is_number, require_kind
-from robotid.base.typing import Array
+from robotid.base.typing import Array, real_numbers
 from robotid.data.log import suggestion
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors

@@ -139,7 +139,7 @@ class Recordings:
             for problem in problems():
                 yield from problem.mass_stream() if problem.mass_stream is not None else ()
 
-        support, is_projected = self.model.support(), bool(self.model.constraints)
+        support, is_projected = self.model.support, bool(self.model.constraints)
         if is_projected:  # every row has the columns of all
             support = np.broadcast_to(support.any(axis=0), support.shape)
         return Problem(

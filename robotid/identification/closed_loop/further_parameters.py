@@ -13,7 +13,7 @@ import numpy as np
 import scipy.linalg
 
 from robotid.base.typing import Array
-from robotid.diagnosis.residual.decisions import SIMULATED_FAMILY, Round
+from robotid.diagnosis.decisions import SIMULATED_FAMILY, Round
 from robotid.dynamics.simulation.loops import friction_at_rest
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import OutputError, is_at_bound, linearised

@@ -11,8 +11,7 @@ from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
 from robotid.diagnosis.catalogue import entries
 from robotid.diagnosis.verdict.parameter_table import correlated_sets
-from robotid.diagnosis.verdict.position_verdict import judge_positions
-from robotid.diagnosis.verdict.verdict import Verdict
+from robotid.diagnosis.verdict.verdict import Verdict, judge_positions
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.friction_projection import DriveMoments, drive_moments
 from robotid.estimation.estimators.estimator import Estimate

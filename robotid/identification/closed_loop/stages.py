@@ -15,8 +15,7 @@ from robotid.data.log import Log
 from robotid.data.measured_velocity import is_trustworthy
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.command_channels import largest_speeds
-from robotid.diagnosis.verdict.evidence import BEATEN
-from robotid.diagnosis.verdict.position_verdict import GOOD, HARDLY
+from robotid.diagnosis.verdict.verdict import BEATEN, GOOD_POSITION, HARDLY
 from robotid.dynamics.simulation.loops import (
     ClosedLoopRobot,
     Loops,
@@ -263,7 +262,7 @@ def _best_start(initial: "_Initial") -> tuple["_Initial", Array]:
         for members in (groups == group for group in dict.fromkeys(initial.groups)):
             if np.mean(error[members] / best[members]) < 1.0 / BEATEN:
                 factor[members], limited[members], best[members] = scale, has_limit, error[members]
-        if not ((best > GOOD) & (best > HARDLY * second_order)).any():
+        if not ((best > GOOD_POSITION) & (best > HARDLY * second_order)).any():
             break
     if not fits:
         raise failures[0]

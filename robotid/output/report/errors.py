@@ -5,8 +5,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any, NamedTuple
 
-from robotid.diagnosis.verdict import evidence
-from robotid.diagnosis.verdict import position_verdict as positions
+from robotid.diagnosis.verdict.verdict import GOOD, GOOD_POSITION, POOR, POOR_POSITION
 from robotid.estimation.fitting.evaluation import Metrics
 from robotid.identification.result import Identification
 from robotid.identification.summary import joint_reason, verdict_cell
@@ -50,7 +49,7 @@ class Quantity:
 TORQUE = Quantity(
     "Torque prediction error",
     "100 |τ − prediction| / |τ|",
-    (evidence.GOOD, evidence.POOR),
+    (GOOD, POOR),
     {
         "wls": Mark("WLS", "M-5 -1h10l-5 6z", "fill"),
         "urdf_with_drives": Mark("URDF + drives", "M-5 19h10l-5 -6z", "fill"),
@@ -61,7 +60,7 @@ TORQUE = Quantity(
 POSITION = Quantity(
     "Simulated position error",
     "100 |q − simulated| / |motion|",
-    (positions.GOOD, positions.POOR),
+    (GOOD_POSITION, POOR_POSITION),
     {
         "second_order": Mark("2nd-order model", "M-5 -1h10l-5 6z", "fill"),
         "rows": Mark("torque fit", "M-5 19h10l-5 -6z", "fill"),

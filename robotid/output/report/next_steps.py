@@ -17,11 +17,10 @@ from robotid.base.settings import is_number
 from robotid.diagnosis.catalogue import entries as catalogue_entries
 from robotid.diagnosis.catalogue import step_of
 from robotid.diagnosis.residual.misfit import setting_of, with_entries
-from robotid.diagnosis.verdict.evidence import GOOD, is_beaten
+from robotid.diagnosis.verdict.verdict import GOOD, is_beaten
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.output.files.exports import formats
 from robotid.robot.drive_term import DriveTerm
-from robotid.robot.drives import COUNTERBALANCE, spring_family
 
 if TYPE_CHECKING:
     from robotid.diagnosis.verdict.scale_check import PayloadCheck
@@ -298,12 +297,7 @@ def _pin(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -
 
 def _terms(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     codes = {cause.code for cause in causes}
-    entries: dict[str, list[str | DriveTerm]] = {
-        finding.joints[0]: [spring_family(finding.evidence["turned"], COUNTERBALANCE)]
-        for cause in causes
-        for finding in cause.findings
-        if finding.code == "counterbalance" and "turned" in finding.evidence
-    }
+    entries: dict[str, list[str | DriveTerm]] = {}
     couplings: dict[frozenset[str], str] = {}
     lacking = [misfit for misfit in found.misfits if misfit.term.code in codes]
     for misfit in lacking:

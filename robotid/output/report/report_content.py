@@ -12,7 +12,7 @@ import numpy as np
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.residual.decisions import DEPENDENCE_SHARE
+from robotid.diagnosis.decisions import LEAST_SHARE
 from robotid.diagnosis.residual.torque_split import JointTorque, friction_split
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.estimation.fitting.evaluation import Evaluation
@@ -266,7 +266,7 @@ def _caption(torque: JointTorque, name: str) -> str:
         result = "too few samples"
     elif dependence.is_significant:
         result = f"<strong>explains {share} % of the variance</strong>"
-    elif dependence.share >= DEPENDENCE_SHARE:
+    elif dependence.share >= LEAST_SHARE:
         result = f"explains {share} % of the variance, not significant"
     return f"Residual against {name}: {result}"
 

@@ -14,7 +14,7 @@ from robotid.base.files import write_text
 from robotid.base.findings import Cause, grouped, tally
 from robotid.base.typing import Array
 from robotid.base.versions import __version__
-from robotid.diagnosis.verdict.evidence import uses_line
+from robotid.diagnosis.verdict.verdict import uses_line
 from robotid.estimation.fitting.evaluation import Evaluated
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.identification.summary import verdict_cell

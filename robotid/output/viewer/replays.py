@@ -18,11 +18,10 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from robotid.base.arguments import real_numbers
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import write_text
 from robotid.base.settings import is_number, require_each, require_kind
-from robotid.base.typing import Array
+from robotid.base.typing import Array, real_numbers
 from robotid.output.pages.html import asset, scaffold
 from robotid.output.viewer.scene import coordinates, mass_marks, packed, robot_scene
 from robotid.robot.model import RobotModel

@@ -10,26 +10,12 @@ from helpers.stands import stand
 from robotid.data.base_motion import BaseMotion, base_state, in_base, quaternions_of_angles
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.logs.base_pose import (
-    check_pose,
-    check_twist,
-    check_unit,
-)
-from robotid.diagnosis.logs.contacts import check_base
-from robotid.robot.constraints import Contact
+from robotid.diagnosis.logs.base_checks import check_base, check_pose, check_twist, check_unit
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
 SLOW = SignalSettings(cutoff=4.0)
 FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return RobotModel.from_urdf(
-        example_urdf("solo12.urdf"), free_flyer=True, terms=(),
-        constraints=[Contact(foot) for foot in FEET],
-    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")

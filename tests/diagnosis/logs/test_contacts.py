@@ -10,7 +10,7 @@ from robotid.data.base_motion import BaseMotion, base_state
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
-from robotid.diagnosis.logs.contacts import check_base
+from robotid.diagnosis.logs.base_checks import check_base
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -16,7 +16,7 @@ from robotid.data.base_motion import (
 )
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.logs.contacts import check_base
+from robotid.diagnosis.logs.base_checks import check_base
 from robotid.dynamics.constraint_rows import constraint_jacobian
 from robotid.robot.constraints import link_positions
 from robotid.robot.examples import example_urdf

@@ -8,9 +8,8 @@ from helpers.corruptions import clean_log, robot
 
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import diagnose
-from robotid.diagnosis.logs.hypotheses import explanations
-from robotid.diagnosis.logs.loads import load_model
-from robotid.diagnosis.logs.torque_sample import smooth_motion, take_probe
+from robotid.diagnosis.logs.hypotheses import explanations, smooth_motion, take_probe
+from robotid.diagnosis.logs.torque_checks import load_model
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -105,14 +104,3 @@ def test_the_fit_is_the_least_squares_of_all_joints_and_drives(ur5, ur5_log):
     assert chi == pytest.approx(np.sum((A / size @ found - b) ** 2), rel=1e-6)
     covariance = np.linalg.inv((A / size).T @ (A / size)) / np.outer(size, size)
     np.testing.assert_allclose(error, np.sqrt(np.diag(covariance))[:10], rtol=1e-4)
-
-
-def test_a_balanced_joint_may_follow_its_position_either_way_and_no_other(ur5, ur5_log):
-    probe = replace(take_probe(ur5, smooth_motion(ur5, ur5_log, SIGNALS)), balanced=(1, 3))
-    drives, c, s = probe.drives, np.cos(probe.q), np.sin(probe.q)
-    assert drives.shape[2] == 5 + 4  # no coupled drives
-    for j in range(6):
-        wave = np.column_stack([c[:, j], s[:, j], -c[:, j], -s[:, j]])
-        np.testing.assert_allclose(drives[:, j, 5:], wave if j in (1, 3) else 0.0 * wave)
-    np.testing.assert_array_equal(drives[:, :, 0], probe.a)
-    np.testing.assert_array_equal(drives[:, :, 3:5], [[[1.0, -1.0]]] * np.ones((*c.shape, 1)))

@@ -11,7 +11,7 @@ from robotid.cli.job import Job, LogEntry
 from robotid.cli.logs import examine
 from robotid.data.files.read import read_log, write_log
 from robotid.data.signal_settings import LogUnits
-from robotid.diagnosis.logs.motion_checks import check_locked, percent_hint
+from robotid.diagnosis.logs.check_logs import check_locked, percent_hint
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.robot.drives import DRIVE_TERMS
 from robotid.robot.examples import example_urdf

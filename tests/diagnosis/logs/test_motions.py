@@ -7,10 +7,11 @@ import pytest
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
+from robotid.data.alike_motions import REPEATED, repeated_share
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
-from robotid.diagnosis.logs.motion_checks import check_excitation, check_repeated_motion
+from robotid.diagnosis.logs.check_logs import check_excitation
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel
@@ -53,16 +54,10 @@ def test_the_share_that_repeats_is_that_of_the_log_that_has_most_of_it(motions):
     old, new = (part.any(axis=1).sum() for part in moved)
     assert old == 400
     for fitted in ([first, second], [second, first]):
-        (found,) = check_repeated_motion(fitted, kept, "kept.csv")
-        assert (found.code, found.severity) == ("repeated_motion", "warning")
-        assert found.evidence["share"] == pytest.approx(old / (old + new), abs=0.005)
-        assert (
-            f"{100 * found.evidence['share']:.0f} % of this validation motion is in a fitted log"
-            in found.message
-        )
-    assert list(check_repeated_motion([second], kept, "kept.csv")) == []
+        assert repeated_share(fitted, kept) == pytest.approx(old / (old + new), abs=0.005)
+    assert repeated_share([second], kept) == 0.0
     # 150 of 650 are less than three tenths
-    assert list(check_repeated_motion([first], joined(first.at(slice(0, 250)), other), "x")) == []
+    assert repeated_share([first], joined(first.at(slice(0, 250)), other)) < REPEATED
 
 
 def test_excitation_is_that_of_the_weighted_rows_of_all_motions(planar, motions):

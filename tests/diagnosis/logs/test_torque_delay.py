@@ -9,6 +9,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs import torque_delay
+from robotid.diagnosis.logs.hypotheses import smooth_motion
 from robotid.robot.model import RobotModel
 
 SIGNALS = SignalSettings()
@@ -57,6 +58,14 @@ def test_noise_of_a_log_without_a_filter_is_no_delay(ur5):
     assert clean.severity == "note"
     assert abs(clean.evidence["delay"]) < 0.005
     assert clean.evidence["gain"] < 0.05
+
+
+def test_all_rows_from_the_first_to_the_last_that_moves_are_used(ur5):
+    motion = smooth_motion(ur5, clean_log(ur5, 100, duration=8.0), SIGNALS)
+    v = motion.v.copy()
+    v[:40] = v[-30:] = 0.0
+    (rows,) = torque_delay._segments(ur5, replace(motion, v=v), 1)
+    np.testing.assert_array_equal(rows, np.arange(40, len(v) - 30))
 
 
 def test_joints_that_hardly_move_have_no_say(ur5):

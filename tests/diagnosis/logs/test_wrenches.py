@@ -9,7 +9,7 @@ from helpers.stands import stand
 
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
-from robotid.diagnosis.logs.contacts import check_base, check_wrenches
+from robotid.diagnosis.logs.base_checks import check_base, check_wrenches
 from robotid.dynamics.constraint_rows import constraint_jacobian
 from robotid.dynamics.prediction import predict
 from robotid.dynamics.simulation.simulation_settings import Controller, Noise, Sensors, Simulation

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robotid.diagnosis.residual.decisions import FEWEST, p_value
+from robotid.diagnosis.decisions import FEWEST, p_value
 from robotid.diagnosis.residual.torque_split import even_bins, follow
 
 B, K, SIZE = 4, 7, 33  # bins, segments, rows of each
@@ -76,7 +76,7 @@ def test_few_stretches_show_means_but_no_share(rows):
 def test_a_dependence_is_significant_by_its_share_and_its_p_value(rows):
     found = follow("speed", "rad/s", *rows)
     for share, p, wanted in (
-        (0.1, 9e-4, True), (0.099, 9e-4, False), (0.1, 1.1e-3, False), (None, 9e-4, False),
+        (0.1, 2.9e-4, True), (0.099, 2.9e-4, False), (0.1, 3.1e-4, False), (None, 1e-4, False),
     ):  # fmt: skip
         assert replace(found, share=share, p_value=p).is_significant == wanted
 

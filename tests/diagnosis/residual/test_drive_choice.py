@@ -6,28 +6,13 @@ from functools import cache, partial
 import numpy as np
 import pytest
 from helpers import driven as helper
-from helpers.driven import (
-    ELBOW,
-    JOINTS,
-    LIFT,
-    arm,
-    driven,
-    driven_log,
-)
+from helpers.driven import ELBOW, JOINTS, LIFT, arm, driven, driven_log
 
 from robotid.base.exceptions import SettingsError
-from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.estimation.fitting.fitted import friction_curve
 from robotid.robot.drive_term import DriveMotion
-from robotid.robot.drives import (
-    AUTO,
-    FAMILIES,
-    Harmonic,
-    LoadFriction,
-    Stribeck,
-    Tanh,
-)
+from robotid.robot.drives import AUTO, FAMILIES, Harmonic, LoadFriction, Stribeck, Tanh
 
 found_in, fitted_in = (partial(f, estimator="wls") for f in (helper.found_in, helper.fitted_in))
 SEED, QUANTILE = 3, 1.5  # of the motion: the elbow turns more than half a turn
@@ -204,27 +189,6 @@ def test_of_families_alike_the_better_conditioned_is_chosen(plain, rising):
 
 def rising_logs(found):
     return [evaluation.recording.log for evaluation in found.fitted]
-
-
-def test_a_counterbalance_that_is_known_is_in_the_model_before_others_are_tried(plain, cases):
-    log = cases("load")[2]
-    fit = fitted_in(plain, [log], friction="none")
-    first = {ELBOW: "harmonics1"}
-    wanted = dict.fromkeys(JOINTS)
-    choices = {c.joint: c for c in choose_drives(fit, wanted, first)}
-    assert choices[ELBOW].families == ("harmonics1", "load")
-    assert choices[ELBOW].tried[0].families == ("harmonics1",)
-    assert choices[ELBOW].tried[0].is_selected
-    assert choices[LIFT].families == ()
-    # what explains far more of the same kind replaces it
-    fit = fitted_in(plain, [cases("harmonics4")[2]], friction="none")
-    choices = {c.joint: c for c in choose_drives(fit, wanted, first)}
-    assert choices[ELBOW].families == ("harmonics4",)
-    assert [x.families for x in choices[ELBOW].tried if x.is_selected] == [
-        ("harmonics1",), ("harmonics4",)
-    ]  # fmt: skip
-    fixed = choose_drives(fit, {**wanted, ELBOW: ("load",)}, first)
-    assert {c.joint: c.families for c in fixed}[ELBOW] == ("load",)
 
 
 def test_harmonics_are_for_joints_that_turn_far_enough(plain):

@@ -18,19 +18,16 @@ from robotid.diagnosis.logs.check_logs import check_logs
 from robotid.diagnosis.residual.misfit import couplings as couplings_of
 from robotid.diagnosis.residual.misfit import (
     find_misfits,
-    misfit_findings,
+    misfit_finding,
     ripples,
     setting_of,
     settled,
 )
 from robotid.diagnosis.residual.term_trials import RIDGE, Trials, take_sample
 from robotid.diagnosis.verdict.verdict import warnings_of
-from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import hold_log
-from robotid.identification.pipeline import conclude, identify
+from robotid.identification.pipeline import identify
 from robotid.robot.drives import AUTO
 from robotid.robot.model import RobotModel
 
@@ -65,7 +62,7 @@ def misfits(found):
 
 
 def findings_of(found):
-    return misfit_findings(found, found.misfits, found.on_misfit)
+    return [misfit_finding(misfit, found, found.on_misfit) for misfit in found.misfits]
 
 
 @pytest.fixture(scope="module")
@@ -116,14 +113,14 @@ def test_a_drift_has_the_trend_of_the_friction_per_minute(three):
     change, error = first.trend
     assert error < 0.05 * abs(true)
     assert abs(change - true) < 3 * error + 0.05 * abs(true)  # the torque filter
-    (finding, *_) = misfit_findings(found, [first], [])
+    finding = misfit_finding(first, found, [])
     assert finding.evidence["trend"] == change
     assert finding.evidence["trend_std_error"] == error
     said = f"friction at the RMS speed falls by {-change:.2g} +- {error:.1g} N m per min. It"
     assert said in finding.message
     (other, *_) = misfits(identified(three, 1, "spring", 2))
     assert np.isnan(other.trend).all()
-    (finding, *_) = misfit_findings(found, [other], [])
+    finding = misfit_finding(other, found, [])
     assert "trend" not in finding.evidence
     assert "per min" not in finding.message
 
@@ -173,6 +170,9 @@ def test_a_ripple_is_named_with_its_periods_a_turn_and_the_terms_that_predict_it
     found = concluded(three, logs, AUTO)
     named, *_ = found.misfits
     assert (named.joint, named.term.name) == (LIFT, "ripple 40")
+    plain = log_with(three, 2, noise=0.0).tau[:, 1]
+    assert named.unit == "N m rms"  # 0.15 of the RMS torque in amplitude
+    assert named.size == pytest.approx(0.15 * np.sqrt(np.mean(plain**2) / 2), rel=0.1)
     pasted = setting_of(named, found)
     assert pasted == (
         f'[drives]\n{LIFT} = [{{ term = "Harmonic", order = 40.0, is_sine = false }}, '
@@ -192,33 +192,15 @@ def test_noise_of_any_colour_is_no_term(three, memory):
     assert misfits(identified(three, 5, noise=0.03, memory=memory)) == ()
 
 
-def test_a_counterbalance_is_named_taken_into_the_model_and_no_error(four):
+def test_a_counterbalance_that_masses_can_imitate_is_never_good(four):
     """40 N m at the lift: gravity of the URDF's is held by the other joints."""
-    model = four
-    logs = [log_with(model, 3, "balancing", 1, part=k) for k in (0, 1)]
-    guesses = check_logs(model, logs[:1], validation=logs[1:])
-    said = [f for f in guesses if f.severity != "note"]
-    assert {(f.code, f.severity) for f in said} == {("counterbalance", "warning")}
-    assert said[0].where == f"run0.csv: {LIFT}"
-    assert f'Add it to the model: {LIFT} = ["harmonics1"] in [drives]' in said[0].message
-    own, kept = ([hold_log(model, log, SignalSettings())] for log in logs)
-    recordings = Recordings(model, structural_mapping(model), own, kept)
-    found = conclude(recordings, FIT, guesses)
-    (choice,) = (c for c in found.drives if c.families)
-    assert (choice.joint, choice.families) == (LIFT, ("harmonics1",))
-    known = [f for f in found.findings if f.code == "counterbalance"]
-    assert {f.severity for f in known} == {"note"}
-    assert "The model includes it: cos1, sin1 of shoulder_lift_joint" in known[0].message
-    assert found.verdict.status == "good"
-    for name, size in (("cos1", 40.0 * np.cos(0.1)), ("sin1", -40.0 * np.sin(0.1))):
-        k = found.model.layout.names.index(f"{LIFT}.{name}")
-        assert abs(found.standard[k] - size) < 2.6 * found.standard_error[k], name
-        assert found.standard_error[k] < 8.0
-    friction = {LIFT: "load", "*": "none"}
-    stated = conclude(recordings, FIT, guesses, friction=friction)
-    (warned, _) = [f for f in stated.findings if f.code == "counterbalance"]
-    assert warned.severity == "warning"
-    assert stated.verdict.joints[LIFT].status == "usable"
+    logs = [log_with(four, 3, "balancing", 1, part=k) for k in (0, 1)]
+    guesses = check_logs(four, logs[:1], validation=logs[1:])
+    assert {f.code for f in guesses if f.severity != "note"} == {"urdf_mismatch"}
+    found = concluded(four, logs, AUTO)
+    assert found.scale_check.gravity[LIFT] < 0.3
+    assert found.scale_check.contradicts
+    assert found.verdict.status == "usable"
 
 
 def test_columns_join_the_regressor_and_base_parameters_are_refitted(three):

@@ -6,11 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from robotid.diagnosis.residual.term_trials import (
-    Normal,
-    Sample,
-    Trials,
-)
+from robotid.diagnosis.residual.term_trials import Normal, Sample, Trials
 
 N, JOINTS, BASE, FITTED, STRETCHES = 90, 2, 3, 7, 9
 

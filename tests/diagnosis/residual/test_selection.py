@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from robotid.diagnosis.residual.decisions import Round, Rule, p_value, select
+from robotid.diagnosis.decisions import Round, Rule, p_value, select
 
 RULE = Rule(most=3, share=0.05, p_value=0.01, alike=0.02)
 

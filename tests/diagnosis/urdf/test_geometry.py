@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from helpers.findings import Figures
 
+from robotid.diagnosis.urdf.inertials import audit_bodies, audit_links
 from robotid.diagnosis.urdf.inspection import inspect_urdf
-from robotid.diagnosis.urdf.mesh_check import audit_bodies, audit_links
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -69,6 +69,9 @@ def test_what_hardly_weighs_hardly_matters(tmp_path):
     light = {"mass": "1e-3", "ixx": "0", "iyy": "0", "izz": "0", "com": "0.2 0 0.3"}
     found = audit(tmp_path, **light)
     assert {(f.code, f.severity) for f in found} == {("com_outside", "note"), ("density", "note")}
+    for mass, severity in (("2.1015e-3", "note"), ("2.1030e-3", "warning")):  # of all: 2.1021 kg
+        (first, *_) = audit(tmp_path, **light | {"mass": mass})
+        assert (first.code, first.severity) == ("com_outside", severity)
 
 
 def test_the_radius_of_gyration_is_that_of_the_inertia(tmp_path):

@@ -9,10 +9,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.base.exceptions import ModelError
 from robotid.base.findings import Finding
 from robotid.diagnosis.logs.check_logs import check_logs
-from robotid.diagnosis.urdf.inertials import (
-    explained_by_assumed,
-    impossible_inertials,
-)
+from robotid.diagnosis.urdf.inertials import explained_by_assumed, impossible_inertials
 from robotid.diagnosis.urdf.inspection import inspect_urdf
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import random_regressor

@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from robotid.diagnosis.verdict.fit_findings import (
-    consistency_findings,
-    locked_findings,
-)
+from robotid.diagnosis.verdict.fit_findings import consistency_findings, locked_findings
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.robot.bodies import density_share
 from robotid.robot.examples import example_urdf
@@ -77,7 +74,7 @@ def test_bounds_that_bind_are_a_warning_where_data_or_masses_contradict_a_stated
         fit.standard = standard
         bounds = SimpleNamespace(mass={"one": [0.1, 2.0]}, com={"two": []})
         fit.estimator = SimpleNamespace(bounds=bounds)
-        found = consistency_findings(fit)
+        found = list(consistency_findings(fit))
         assert all(f.code == "active_bound" for f in found)
         return [(f.severity, f.where, f.message) for f in found]
 

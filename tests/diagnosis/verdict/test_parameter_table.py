@@ -7,7 +7,11 @@ import numpy as np
 import pytest
 
 from robotid.diagnosis.verdict import parameter_table
-from robotid.diagnosis.verdict.parameter_table import correlated_parameters
+from robotid.diagnosis.verdict.parameter_table import (
+    central_parameters,
+    correlated_parameters,
+    correlated_sets,
+)
 from robotid.output.files.entries import build_result
 from robotid.output.files.result_file import Result
 
@@ -55,6 +59,16 @@ def test_the_interval_of_a_parameter_that_is_a_base_parameter_is_that_of_it(iden
     assert (reach >= 1.95).all()
 
 
+def test_a_body_with_a_parameter_without_an_error_has_no_interval(identified):
+    keys = ("model", "standard", "prior", "standard_quantile", "standard_covariance")
+    found = SimpleNamespace(**{key: getattr(identified, key) for key in keys})
+    found.standard_error = identified.standard_error.copy()
+    found.standard_error[13] = np.inf
+    half = central_parameters(found).half
+    assert np.isinf(half[1]).all()
+    assert np.isfinite(half[[0, 2]]).all()
+
+
 def test_a_parameter_is_correlated_with_another_one_of_its_own_drive_that_has_an_error():
     """Two drives of four parameters each, behind two of a body."""
     drives = [(k // 4, None) for k in range(8)]
@@ -77,3 +91,24 @@ def test_a_parameter_is_correlated_with_another_one_of_its_own_drive_that_has_an
     pairs = correlated_parameters(found)
     assert {i: k for i, (k, _) in pairs.items()} == {i: k for i, (k, _) in wanted.items()}
     assert [r for _, r in pairs.values()] == pytest.approx([r for _, r in wanted.values()])
+
+
+def test_sets_are_joined_by_correlations_of_either_sign_and_hold_numbers_of_all_parameters():
+    """Of nine parameters 7, 1 and 4 hang together, in two steps, and 2 and 8; 0 is left out."""
+    R = np.eye(9)
+    for i, k, r in ((7, 1, 0.97), (1, 4, -0.96), (7, 4, -0.94), (2, 8, -0.951), (0, 3, 0.99),
+                    (5, 6, 0.949)):  # fmt: skip
+        R[i, k] = R[k, i] = r
+    size = np.array([1.0, 3.0, 0.2, 10.0, 0.5, 2.0, 7.0, 0.01, 5.0])
+    C = R * np.outer(size, size)
+    assert correlated_sets(C, [1, 2, 4, 5, 6, 7, 8]) == [[1, 4, 7], [2, 8]]
+    assert correlated_sets(C, [8, 7, 4, 2]) == [[8, 2]]
+    assert correlated_sets(C, [3, 0, 5]) == [[3, 0]]
+    assert correlated_sets(C, [5, 6]) == []
+
+
+def test_a_parameter_that_joins_two_sets_makes_them_one():
+    R = np.eye(5)
+    for i, k in ((0, 1), (2, 3), (1, 3)):
+        R[i, k] = R[k, i] = 0.96
+    assert correlated_sets(R, range(5)) == [[0, 1, 2, 3]]

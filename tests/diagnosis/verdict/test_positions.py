@@ -1,6 +1,6 @@
 """Verdicts on simulated positions: by thresholds, plainer models, and what else is known."""
 
-from robotid.diagnosis.verdict.position_verdict import judge_positions
+from robotid.diagnosis.verdict.verdict import judge_positions
 from robotid.estimation.fitting.evaluation import JointMetrics, Metrics
 from robotid.identification.summary import verdict_lines
 

@@ -8,6 +8,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.verdict.scale_check import ScaleCheck, common_factor
+from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia
@@ -46,6 +47,15 @@ def test_a_robot_like_its_urdf_is_good_and_its_urdf_bears_witness(alike):
     assert found.scale_check.factor == pytest.approx(1.0, abs=0.01)
     for joint, ratio in found.scale_check.gravity.items():
         assert ratio == pytest.approx(1.0, abs=5 * found.scale_check.gravity_error[joint] + 1e-3)
+    model, (e,), size = found.model, found.fitted, found.model.layout.n_inertial
+    q = e.recording.trajectory.q
+    q = q[:: -(-len(q) // 300)]
+    Y = joint_torque_regressor(model, q, 0 * q, 0 * q).reshape(len(q), 6, -1)[:, 1, :size]
+    u = Y @ found.prior[:size]
+    slope = u @ Y / (u @ u)  # of the ratio of the second joint
+    variance = slope @ found.standard_covariance[:size, :size] @ slope
+    error = found.scale_check.gravity_error[model.joints[1]]
+    assert error == pytest.approx(np.sqrt(variance), rel=1e-6)
     assert found.scale_check.agrees
     assert found.verdict.status == "good"
     assert "within 5 %" in found.verdict.reasons[-1]
@@ -113,9 +123,7 @@ def test_a_result_that_its_prior_holds_back_bears_no_witness(four, rng):
     size = four.layout.n_inertial
     pi[:size] = 3.0 * four.standard_parameters()[:size]  # the sensors say three times the URDF
     log = exact_log(four, pi, rng, samples=1000, noise=0.5)
-    kept = EstimatorSettings(
-        prior_weight=1e9,
-    )
+    kept = EstimatorSettings(prior_weight=1e9)
     held = identify(four, [log], estimator=kept)
     assert held.scale_check.factor == pytest.approx(1.0, abs=0.05)  # it stays at the URDF
     assert not held.scale_check.follows

@@ -2,8 +2,8 @@
 
 import pytest
 
-from robotid.diagnosis.verdict.evidence import uses_line, uses_of_motion, uses_of_torques
 from robotid.diagnosis.verdict.scale_check import ScaleCheck
+from robotid.diagnosis.verdict.verdict import uses_line, uses_of_motion, uses_of_torques
 
 VERIFIED = ScaleCheck({"a": 1.0, "b": 1.0}, scale=1.0, factor=1.0, masses=(20.0, 20.0, 0.0))
 OPEN = ScaleCheck({"a": 1.2, "b": 1.2}, scale=1.2, factor=1.2, masses=(20.0, 24.0, 0.0))

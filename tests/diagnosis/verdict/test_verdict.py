@@ -3,11 +3,13 @@ from dataclasses import replace
 import pytest
 
 from robotid.base.findings import Finding
-from robotid.diagnosis.verdict.evidence import Determined, Predictions, is_beaten
 from robotid.diagnosis.verdict.scale_check import ScaleCheck
 from robotid.diagnosis.verdict.verdict import (
+    Determined,
+    Predictions,
     VerdictWarning,
     blocking,
+    is_beaten,
     is_downweighted,
     judge,
     rejected,
@@ -319,6 +321,9 @@ def test_joints_better_by_the_urdf_are_those_of_all_logs():
     found = Predictions(fit, {name: Metrics(own, 1.0) for name, own in logs.items()}, "abcde")
     (reason,) = found.better_by_urdf()
     assert reason.startswith("the URDF with fitted drives predicts b, a better than")
+    (reason,) = found.better_by_urdf({"a"})  # bodies are not blamed for another gain
+    assert reason.startswith("the URDF with fitted drives predicts b better than")
+    assert found.better_by_urdf({"a", "b"}) == []
     assert found.at_rest() == [
         "the joints e do not move in any recording: not evaluated",
         "the joints d do not move in any validation log: not evaluated",

@@ -8,8 +8,7 @@ from helpers.driven import EXACT, arm, driven_log
 from helpers.synthetic import truth
 
 from robotid.data.alike_motions import alike_motions
-from robotid.diagnosis.verdict.evidence import Determined, Predictions
-from robotid.diagnosis.verdict.verdict import judge
+from robotid.diagnosis.verdict.verdict import Determined, Predictions, judge
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.evaluation import LEFT_OUT, logs_that_test

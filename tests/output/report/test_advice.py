@@ -16,14 +16,14 @@ from robotid.diagnosis.residual.misfit import (
     CANDIDATES,
     Misfit,
     couplings,
-    misfit_findings,
+    misfit_finding,
     ripples,
     setting_of,
 )
 from robotid.diagnosis.verdict.verdict import JointVerdict, Verdict
 from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.identification.closed_loop.loop_settings import LoopSettings
-from robotid.output.report.next_steps import Origin, Step, _once, next_steps
+from robotid.output.report.next_steps import Origin, Step, _once, next_steps, sentence_of
 from robotid.robot.examples import example_urdf
 
 JOB = Origin(("my job.toml",), "out")
@@ -82,7 +82,6 @@ def test_every_command_is_one_that_the_program_takes(identified):
 NAMED = {
     "backlash": "Exclude the samples",
     "clipped": "Record a slower motion",
-    "counterbalance": "Add the missing drive terms",
     "coupling": "Add the missing drive terms",
     "drift": "Drift is so; do something",
     "friction_shape": "Add the missing drive terms",
@@ -132,7 +131,8 @@ def test_every_setting_that_is_advised_for_a_term_is_read(identified, joint, rng
         for entries in ((name,) for name in term.families) if term.families else (term.terms,):
             found = told(identified, misfits=(lacking(joint, term, entries),))
             setting = setting_of(found.misfits[0], found)
-            (finding,) = misfit_findings(found, found.misfits, found.on_misfit)
+            (misfit,) = found.misfits
+            finding = misfit_finding(misfit, found, found.on_misfit)
             if not setting:
                 assert term.name in ("coulomb", "windup", "drift")
                 assert finding.message.endswith(term.advice)
@@ -158,18 +158,14 @@ def test_a_named_cause_has_its_step_and_no_guess_beside_it(identified, code, rng
     own = [c for c in candidates(joint, "wrist_1_joint", rng) if c.code == code]
     entries = {c.name: c.families[:1] or c.terms for c in own}
     lacks = [lacking(joint, c, entries[c.name]) for c in own[:2]]
-    evidence = {"turned": 2.0} if code == "counterbalance" else {}
-    found = told(
-        identified, warning("unexplained_torque"), warning(code, **evidence), misfits=tuple(lacks)
-    )
+    found = told(identified, warning("unexplained_torque"), warning(code), misfits=tuple(lacks))
     steps = next_steps(found, JOB)
     assert not any(_guesses(step, joint) for step in steps)
     assert sum(step.words.startswith(NAMED[code]) for step in steps) == 1
     blocks = [block for step in steps for block in step.blocks]
-    if code in ("counterbalance", "friction_shape", "spring"):
+    if code in ("friction_shape", "spring"):
         (drives,) = [block for block in blocks if block.startswith("[drives]")]
         wanted = {
-            "counterbalance": ("harmonics1",),
             "friction_shape": ("stribeck",),
             "spring": ("harmonics2", "spring"),
         }
@@ -311,3 +307,15 @@ def test_a_poor_result_of_torques_is_not_exported(identified):
     assert wrong.has_urdf
     assert blocks
     assert not any(block.split()[1] in ("export", "validate") for block in blocks)
+
+
+@pytest.mark.parametrize(
+    ("message", "wanted"),
+    [
+        ("first_2.csv: a load", "first_2.csv: a load"),
+        ("a.csv, b.csv: it", "a.csv, b.csv: it"),
+        ("the torque", "The torque"),
+    ],
+)
+def test_the_name_of_a_file_keeps_its_letters(message, wanted):
+    assert sentence_of(Finding("x", "warning", "y", message).message) == wanted

@@ -7,7 +7,7 @@ from html import unescape
 import pytest
 from helpers.pages import bars
 
-from robotid.diagnosis.verdict.evidence import GOOD, POOR
+from robotid.diagnosis.verdict.verdict import GOOD, POOR
 from robotid.output.report.errors import worst_errors
 from robotid.output.report.next_steps import Origin, next_steps
 from robotid.output.report.report_content import torque_report

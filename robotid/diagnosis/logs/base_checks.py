@@ -1,4 +1,4 @@
-"""Checks of the pose of a floating base and of its IMU: jumps, units, quaternion, axes, twist."""
+"""Checks of a floating base and of contacts: pose, twist, IMU, measured forces, feet that move."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -15,28 +15,222 @@ from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.diagnosis.catalogue import finding
-from robotid.robot.constraints import link_positions
+from robotid.dynamics.completed_logs import closed_log, with_contacts
+from robotid.dynamics.constraint_rows import (
+    constraint_jacobian,
+    force_basis,
+    touching,
+    without_forces,
+)
+from robotid.dynamics.prediction import predict
+from robotid.robot.constraints import Contact, link_positions
 from robotid.robot.model import RobotModel
 
-_MOVES = 5e-3  # [m/s] mean speed of feet on the ground below which no other pose is tried
+_MOST = 1000  # samples at which poses and forces are compared
+_MOVES = 5e-3  # [m/s] speed of feet on the ground below which they are at rest
+_SLIDES = 0.1  # [m/s] RMS speed of a foot in contact that is reported ...
+_STANDS = 0.3  # ... if it is above this share of its speed without contact, or without rolling
+_LOADED = 0.1  # of the largest measured force: a foot with more is on the ground
+_ALIKE = (0.6, 1.6)  # factors of the forces that a wrong URDF explains
+_FORCE_UNITS = {"kN": 1e3, "kgf": 9.81}
 _SLOWER = 0.65  # ratio of the speeds below which another pose is found ...
-_BETTER = 0.5  # ... and of the differences below which another twist is
+_BETTER = 0.5  # ... and of residuals, below which other forces or another twist are
 _SIMPLER = 1.2  # a pose with another change is preferred if it reduces the speed by this ...
-_FLOOR = 1e-3  # [m/s] ... plus this
-_MOST = 1000  # samples at which poses are compared
-_TURNS_BY = 1e-3  # [m/s or rad/s] RMS from which velocities are compared
-_UNLIKE, _SOME = 0.3, 0.05  # of the motion: difference of a wrong velocity, of one with a cause
-_UNITS = {"linear": ("mm/s", 1e-3), "angular": ("deg/s", np.pi / 180)}
+_NOISE = 1e-3  # [m/s or rad/s] ... plus this; RMS from which velocities are compared
+# of the motion or weight: difference of a wrong velocity or force, of a velocity with a cause
+_UNLIKE, _SOME = 0.3, 0.05
+_DEGREES = np.pi / 180
+_UNITS = {"linear": ("mm/s", 1e-3), "angular": ("deg/s", _DEGREES)}
 _BACK = np.array([-1.0, -1.0, -1.0, 1.0])  # signs of the inverse quaternion
 _ABOVE = 0.3  # vertical distance of base and feet over their distance, from which one is above
+_ALONG = 0.8  # component of the unit vector from the feet to the base that may be the vertical
 _STRIDE = 0.2  # [s] over which the acceleration of a base is averaged against noise
 _FASTEST = 30.0  # [m/s^2] RMS of this above which its position is in mm
-_ALONG = 0.8  # component of the unit vector from the feet to the base that may be the vertical
 _IMU_MOVES = 0.1  # [rad/s] RMS from which angular velocities are compared
 _TILT = 8.0  # [deg] largest angle between the mean specific force and the vertical
 _SIZE = 0.1  # largest relative error of its size
 _SHORTEST = 2.0  # [s] in which the mean acceleration of a robot is small
-_DEGREES = np.pi / 180
+
+
+def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator[Finding]:
+    """Yield findings on the base and the contacts of one log."""
+    imu = None if log.base is None else log.base.imu
+    if wrong := list(check_unit(log)):
+        yield from wrong
+        return
+    if imu is None:
+        yield from check_pose(log)
+    twist = check_twist(log, signals)
+    if not model.contacts and imu is None:
+        yield from twist
+        return
+    still = replace(signals, velocity="differentiated", acceleration="differentiated")
+    try:
+        log = closed_log(model, log)
+        motion = process(log, still)
+        wrong = list(check_order(model, log, motion))
+        whole = log if wrong else with_contacts(model, log, signals)
+        motion = process(whole, still)
+    except DataError:  # too short, or no contacts: raised again when the log is read
+        yield from twist
+        return
+    yield from wrong or twist
+    if wrong:
+        return
+    for note in whole.notes[len(log.notes) :]:
+        yield finding("log_note", log.name, text=note)
+    flags = _flags(model, log, whole, motion.t)
+    wrong = [] if imu is None else list(check_imu(whole, motion))
+    yield from wrong
+    is_turned = any(one.code in ("imu_axes", "base_orientation") for one in wrong)
+    if not model.contacts or is_turned:
+        return
+    if not wrong:
+        yield from check_wrenches(model, log.name, motion)
+    yield from _check_feet(model, log, motion, flags)
+
+
+def _flags(model: RobotModel, log: Log, whole: Log, t: Array) -> Array:
+    """Return whether each contact of a log is in contact at times, shape (N, contacts), bool.
+
+    ``whole`` is the log with the contacts that were found.
+    """
+    flags = np.ones((len(t), len(model.contacts)), dtype=bool)
+    for k, contact in enumerate(model.contacts):
+        if contact.is_measured:
+            flags[:, k] = _loaded(contact, log, t)
+        elif not contact.always and contact.frame in whole.contacts:
+            flags[:, k] = _at(whole.contacts[contact.frame], whole, t)
+    return flags
+
+
+def check_wrenches(model: RobotModel, log: str, motion: Trajectory) -> Iterator[Finding]:
+    """Yield a finding if measured forces have another sign or unit.
+
+    With the bodies of the URDF, W pi = J^T f in the rows of a floating base, less unknown forces.
+    The factor of f with the smallest residual is -1, or another unit.
+    """
+    if motion.wrenches is None or not any(x.measured for x in model.contacts):
+        return
+    every = max(1, len(motion.t) // _MOST)
+    wrenches, motion = motion.wrenches[::every], motion.every(every)
+    (torque,) = predict(model, [model.standard_parameters()], motion)
+    g = float(np.linalg.norm(model.pin_model.gravity.linear))
+    weight = sum(x.mass for x in model.pin_model.inertias) * g
+    J, basis = _base_rows(model, motion)
+    caused = without_forces(basis, np.einsum("kmj,km->kj", J, wrenches))
+    left = without_forces(basis, torque[:, :6])
+    square = float(np.sum(caused**2))
+    factor = float(np.sum(caused * left)) / square if square > 0.0 else 1.0
+    if _ALIKE[0] <= factor <= _ALIKE[1]:
+        return
+    what = next(
+        (x for x, unit in _FORCE_UNITS.items() if _ALIKE[0] < factor / unit < _ALIKE[1]), "unit"
+    )
+    if abs(factor + 1.0) < 1.0 - _ALIKE[0]:
+        factor, what = -1.0, "reversed"
+    stated, best = (rms((left - x * caused)[:, :3]) for x in (1.0, factor))
+    if stated > _UNLIKE * weight and best < _BETTER * stated:
+        yield finding("measured_wrench", log, what=what, force=stated, best=best, factor=factor)
+
+
+def _base_rows(model: RobotModel, motion: Trajectory) -> tuple[Array, Array]:
+    """Return the rows of the base per measured component, (N, m, 6), and of unknown forces."""
+    J = constraint_jacobian(model, motion.q, touching(model, motion))[:, :, :6]
+    known, first = list[int](), 0
+    for x in model.constraints:
+        if isinstance(x, Contact):
+            known += [first + k for k in x.rows_measured]
+        first += x.sizes[x.kind]
+    used = np.ones((len(J), 6), dtype=bool)
+    return J[:, known], force_basis(np.delete(J, known, axis=1), used, floats=True)
+
+
+def _check_feet(model: RobotModel, log: Log, motion: Trajectory, flags: Array) -> Iterator[Finding]:
+    """Yield findings on the motion of each link in contact."""
+    J, turn = _contact_jacobian(model, motion.q)
+    velocity = np.einsum("kcij,kj->kci", J, motion.v)  # (N, contacts, 3) [m/s]
+    has_ground = log.base is None or log.base.has_position
+    if not has_ground:  # relative to the median of the links in contact, if there are two
+        pairs = (flags.sum(axis=1) > 1)[:, None, None]
+        standing = np.where(flags[..., None] | ~pairs, velocity, np.nan)
+        velocity = (velocity - np.nanmedian(standing, axis=1)[:, None]) * pairs
+    squares = np.sum(velocity**2, axis=2)
+    for k, contact in enumerate(model.contacts):
+        stated = (
+            np.ones(len(log.t), dtype=bool) if contact.always else log.contacts.get(contact.frame)
+        )
+        if stated is None or contact.is_measured:  # found from this motion, or not needed
+            continue
+        touches, link = _at(stated, log, motion.t), contact.frame
+        if contact.kind == "point" and has_ground:
+            w = np.einsum("kij,kj->ki", turn[:, k], motion.v)
+            rolls = np.column_stack([w[:, 1], -w[:, 0], 0.0 * w[:, 2]])  # v / radius
+            if rolling := _radius(contact.radius, velocity[touches, k], rolls[touches]):
+                radius, before, after = rolling
+                yield finding(
+                    "rolling_contact", log.name, subject=link, link=link, radius=radius,
+                    before=before, after=after,
+                )  # fmt: skip
+                continue
+        in_contact, apart = (
+            float(np.sqrt(squares[at, k].mean())) if at.any() else np.inf
+            for at in (touches, ~touches)
+        )
+        if _SLIDES < in_contact < np.inf and (in_contact > _STANDS * apart or touches.all()):
+            yield finding("moving_contact", log.name, subject=link, link=link, speed=in_contact)
+
+
+def _at(flags: Array, log: Log, t: Array) -> Array:
+    """Return flags at other times: those of the last row."""
+    rows = np.searchsorted(log.t, t + 1e-9, side="right") - 1
+    return np.asarray(flags[rows.clip(0, len(flags) - 1)])
+
+
+def _loaded(contact: Contact, log: Log, t: Array) -> Array:
+    """Return whether the measured force of a contact is not small, shape (N,), bool."""
+    forces = [part for part in contact.measured if part.startswith("f")]
+    parts = [log.wrenches[f"{part} {contact.frame}"] for part in forces]
+    size = np.linalg.norm(parts, axis=0)
+    return _at(size > _LOADED * size.max(), log, t)
+
+
+def _contact_jacobian(model: RobotModel, q: Array) -> tuple[Array, Array]:
+    """Return the Jacobians (N, k, 3, n_rows) of the k points of contact, and of their links' turn.
+
+    Their axes are those of the world.
+    """
+    surfaces = tuple(Contact(contact.frame, "surface") for contact in model.contacts)
+    every = np.ones((len(q), len(surfaces)), dtype=bool)
+    J = constraint_jacobian(replace(model, constraints=surfaces), q, every)
+    J = J.reshape(len(q), len(surfaces), 6, model.n_rows)
+    radius = np.array([contact.radius for contact in model.contacts])[:, None]
+    J[:, :, 0] -= radius * J[:, :, 4]  # v + w x (0, 0, -radius)
+    J[:, :, 1] += radius * J[:, :, 3]
+    return J[:, :, :3], J[:, :, 3:]
+
+
+def _radius(stated: float, v: Array, rolls: Array) -> tuple[float, float, float] | None:
+    """Return the radius of a foot in contact that rolls as a ball of another one than stated.
+
+    With it are the median speeds with the stated radius and with this one.
+    """
+    if not rolls.any():
+        return None
+    # weighted median of v / roll: the smallest sum of |v - change roll|, samples that slip apart
+    u, along = rolls[:, :2].ravel(), v[:, :2].ravel()
+    u, along = u[u != 0.0], along[u != 0.0]
+    ratio = along / u
+    order = np.argsort(ratio)
+    weight = np.cumsum(np.abs(u)[order])
+    change = float(ratio[order][np.searchsorted(weight, 0.5 * weight[-1])])
+    before, after = (
+        float(np.median(np.linalg.norm(v[:, :2] - x * rolls[:, :2], axis=1))) for x in (0.0, change)
+    )
+    radius = stated + change
+    if radius <= 0.0 or before < _MOVES or after > _STANDS * before:
+        return None
+    return radius, before, after
 
 
 def check_pose(log: Log) -> Iterator[Finding]:
@@ -75,9 +269,9 @@ def check_twist(log: Log, signals: SignalSettings) -> Iterator[Finding]:
     base = log.base
     if base is None or base.twist is None or base.imu is not None:
         return
-    own = replace(signals, velocity="measured", acceleration="differentiated")
-    try:
-        motion = process(replace(log, v=np.zeros_like(log.q)), own)  # that of joints has no effect
+    settings = replace(signals, velocity="measured", acceleration="differentiated")
+    try:  # the velocity of joints has no effect
+        motion = process(replace(log, v=np.zeros_like(log.q)), settings)
     except DataError:  # too short: raised again when the log is read
         return
     place, quaternion, twist = motion.q[:, :3], motion.q[:, 3:7], motion.v[:, :6]
@@ -103,7 +297,7 @@ def check_twist(log: Log, signals: SignalSettings) -> Iterator[Finding]:
         cause = min(causes | turned, key=lambda key: (causes | turned)[key])
         best = (causes | turned)[cause]
         is_explained = best < _BETTER * off
-        if size < _TURNS_BY or off < (_SOME if is_explained else _UNLIKE) * size:
+        if size < _NOISE or off < (_SOME if is_explained else _UNLIKE) * size:
             continue
         figures: dict[str, Any] = {"size": size, "best": best, "what": what, "unit": unit}
         if is_explained and cause in turned:
@@ -164,8 +358,7 @@ class _Feet:
     def upwards(self, R: Array) -> Array:
         """Return the mean unit vector from the contacts to the base, shape (3,)."""
         x = self.x / np.linalg.norm(self.x, axis=2, keepdims=True).clip(1e-9)
-        up: Array = -(x @ R.swapaxes(1, 2)).mean(axis=(0, 1))
-        return up
+        return np.asarray(-(x @ R.swapaxes(1, 2)).mean(axis=(0, 1)))
 
 
 def check_order(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[Finding]:
@@ -197,7 +390,7 @@ def _check_readings(log: Log, feet: _Feet, q: Array, gravity: Array) -> Iterator
     stated = feet.turned(q)
     mean, speed = feet.upwards(stated[0]), feet.speed(stated)
     height, is_moving = float(mean @ up), speed >= _MOVES
-    found: list[tuple[float, float, str, str]] = []  # rank, speed, reading, gravity
+    slower: list[tuple[float, float, str, str]] = []  # rank, speed, reading, gravity
     for key, quaternion in (
         orientation_readings(q).items() if is_moving or height <= -_ABOVE else ()
     ):
@@ -208,9 +401,9 @@ def _check_readings(log: Log, feet: _Feet, q: Array, gravity: Array) -> Iterator
         remedy = "" if is_above else _vertical(direction, gravity)
         if (is_slow or is_turned_back) and remedy is not None:
             changes = (key == "both") + bool(remedy)
-            found.append(((moves + _FLOOR) * _SIMPLER**changes, moves, key, remedy))
-    if found:
-        _, best, key, remedy = min(found, key=lambda x: x[0])
+            slower.append(((moves + _NOISE) * _SIMPLER**changes, moves, key, remedy))
+    if slower:
+        _, best, key, remedy = min(slower, key=lambda x: x[0])
         yield finding(
             "base_orientation", log.name, source="feet", reading=key, cure=key, speed=speed,
             best=best, side=height < -_ABOVE, turn=bool(remedy), gravity=remedy,
@@ -280,8 +473,7 @@ def _check_gravity(log: Log, frame: ImuFrame, motion: Trajectory) -> Iterator[Fi
     """Yield a finding if the mean specific force in the world is not opposite to gravity."""
     quaternion, v, a = motion.q[:, 3:7], motion.v, motion.a
     f = a[:, :3] + np.cross(v[:, 3:6], v[:, :3]) - in_base(quaternion, frame.gravity)
-    back = quaternion * np.array([-1.0, -1.0, -1.0, 1.0])
-    mean = in_base(back, f).mean(axis=0)
+    mean = in_base(quaternion * _BACK, f).mean(axis=0)
     g = float(np.linalg.norm(frame.gravity))
     size = float(np.linalg.norm(mean))
     cosine = -float(mean @ frame.gravity) / max(g * size, 1e-12)

@@ -44,8 +44,11 @@ UNDECIDED_P_VALUE = 0.25
 TENFOLD = 10.0
 #: Distance from a bound, of the logarithm of its range, within which a shape is at the bound.
 AT_BOUND = 0.02
+#: Share of the squared residual that a missing term, a recording or URDF that differs, or a
+#: quantity must explain, and the largest p-value of that share.
+LEAST_SHARE, P_VALUE = 0.1, 3e-4
 # Terms that a drive model lacks: benchmarks/bench_misfit.py
-MISFIT = Rule(most=3, share=0.1, p_value=3e-4, alike=_ALIKE)
+MISFIT = Rule(most=3, share=LEAST_SHARE, p_value=P_VALUE, alike=_ALIKE)
 #: Share of the squared residual above which a term is a warning.
 MISFIT_WARNS = 0.25
 #: Size over the torque above which a term is reported, and above which it is a warning.
@@ -61,25 +64,35 @@ GROWN = 1.3
 # Recordings or URDF that differ from what was stated: benchmarks/bench_verdict.py. Only the best
 # hypothesis is tested.
 ALTERATION = Rule(most=3, share=-float("inf"), p_value=None, alike=_ALIKE)
-ALTERATION_P_VALUE, ALTERATION_SHARE = 3e-4, 0.1
 #: A smaller share is also reported if validation logs confirm it fully, its p-value is tiny and its
 #: size is twice the one that changes a result: it biases masses even if noise hides it.
 WEAK, WEAK_P_VALUE, WEAK_SIZE = 0.03, 1e-5, 2.0
 #: Standard errors that its size must differ from 0.
 SIGNIFICANT = 5.0
-# A residual that depends on a quantity: no benchmark, tests/diagnosis/residual/test_torque_split.py
-DEPENDENCE_SHARE, DEPENDENCE_P_VALUE = 0.1, 1e-3
 # Segments that are held out in turn, and their samples.
 SEGMENTS, SHORTEST = 16, 10  # most segments, and fewest independent samples of one
 #: Smallest number of segments for a test.
 FEWEST = 6
 #: Typical residuals above which a sample is excluded.
 OUTLIER = 12.0
+#: Standard errors, or deviations, beyond which a value is no noise.
+BEYOND_NOISE = 3.0
+#: Share of the rows from which a fault of single rows is reported.
+SHARE_OF_ROWS = 0.02
+#: Instants of a motion that are used: more are not independent after the filter.
+ROWS = 2000
+#: Relative size below which a quantity counts as 0.
+TINY = 1e-6
 #: Share of a column below which it is rounding, and relative step of a derivative by a shape.
 ROUNDING, STEP = 1e-10, 1e-3
+#: Size of the correlation from which two parameters or signals are strongly correlated: if one were
+#: known, the error of the other would be less than a third of what it is, sqrt(1 - r^2) = 0.31.
+CORRELATED = 0.95
+#: Segments from which a scatter is determined.
+SCATTERED = 3
+#: A sum of squares that is 0, as a divisor.
+NOTHING = 1e-300
 _STILL = 1e-9  # of the largest squared residual of a segment: below, the joint is at rest in it
-_FEWEST = 3  # segments for a test
-_NOTHING = 1e-300
 Option = TypeVar("Option", bound=Hashable)
 
 
@@ -99,7 +112,7 @@ class Round(Generic[Option]):
 
     def share(self, option: Option) -> float:
         """Return the share of the squared residual of fitted logs that an option removes [-]."""
-        return self.gain(option) / max(self.whole, _NOTHING)
+        return self.gain(option) / max(self.whole, NOTHING)
 
     def p_value(self, option: Option) -> float:
         """Return the p-value of the reduction by an option [-]."""
@@ -156,8 +169,8 @@ def p_value(before: Array, after: Array, fitted: int) -> float:
 def _student(before: Array, after: Array) -> float:
     """Return the p-value of the mean share; 1 for too few segments."""
     moves = before > _STILL * before.max(initial=0.0)
-    if moves.sum() < _FEWEST:
+    if moves.sum() < SCATTERED:
         return 1.0
     gain = (before - after)[moves] / np.maximum(before, after)[moves]
-    spread = max(float(np.std(gain, ddof=1)) / np.sqrt(len(gain)), _NOTHING)
+    spread = max(float(np.std(gain, ddof=1)) / np.sqrt(len(gain)), NOTHING)
     return float(stdtr(len(gain) - 1, -gain.mean() / spread))
