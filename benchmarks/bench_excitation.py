@@ -29,7 +29,7 @@ import numpy as np
 import scipy.optimize
 
 from robotid.cli import main as robotid
-from robotid.design.basis import FourierBasis
+from robotid.design.design import FourierBasis
 from robotid.design.clearance import Clearance
 from robotid.design.design import Designer
 from robotid.design.limits import MotionLimits

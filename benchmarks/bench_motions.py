@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from bench_excitation import identified, must, record
 
-from robotid.design.basis import DesignedMotion, FourierBasis
+from robotid.design.design import DesignedMotion, FourierBasis
 from robotid.design.design import Designer
 from robotid.design.excitation import write_motion
 from robotid.design.limits import MotionLimits

@@ -15,7 +15,7 @@ import pytest
 from helpers.commanded_results import written_result
 from helpers.mujoco_plant import plant, recorded
 from helpers.paths import DOCS
-from helpers.recorders import messages_of, write_bag2, write_lerobot
+from helpers.recorders import write_lerobot
 from helpers.synthetic import exact_log, truth
 
 import robotid
@@ -151,29 +151,6 @@ def test_a_trajectory_for_ros_begins_where_the_robot_is_sent(tmp_path, monkeypat
     assert points == "points:"
     assert velocity.startswith("  velocities: [")
     assert end == "  time_from_start: {sec: 10, nanosec: 0}"
-
-
-def test_a_bag_of_joint_states(tmp_path, monkeypatch, ur5, rng):
-    monkeypatch.chdir(tmp_path)
-    log = exact_log(ur5, truth(ur5), rng, samples=300, rate=100.0)
-    write_bag2(tmp_path / "first", {"/joint_states": messages_of(log)})
-    words = re.search(r"robotid (convert .*?)`", (DOCS / "how_to/ros2.md").read_text())[1]
-    assert main(words.split()) == 0
-    again = robotid.read_log("first.parquet", ur5.joints)
-    np.testing.assert_allclose(again.tau, log.tau)
-
-
-def test_columns_of_plotjuggler(tmp_path):
-    rows = re.findall(r"\| `(\S+)` \| (\w+)", (DOCS / "how_to/plotjuggler.md").read_text())
-    path = tmp_path / "first.csv"
-    with path.open("w") as file:
-        np.savetxt(
-            file, np.arange(80.0).reshape(20, 4) / 100.0, "%.9f", ",", comments="",
-            header=",".join(name for name, _ in rows),
-        )  # fmt: skip
-    log = robotid.read_log(path, ["elbow"])
-    assert [meaning for _, meaning in rows] == ["time", "position", "velocity", "torque"]
-    np.testing.assert_allclose(log.tau[:2, 0], [0.03, 0.07])
 
 
 def test_a_dataset_of_lerobot(tmp_path, monkeypatch, capsys):

@@ -45,10 +45,6 @@ def folder(logs, monkeypatch):
     return logs
 
 
-def test_it_is_read_in_three_minutes():
-    assert len(README.splitlines()) <= 150
-
-
 def test_its_links_and_pictures_exist():
     links = re.findall(r"\]\((?!http)([^)#]+)", README)
     assert len(links) > 15
@@ -99,23 +95,11 @@ def test_the_recipes_are_job_files(folder, recipe):
     assert bool(job.couplings) == (recipe == "coupled")
 
 
-def test_each_command_is_one_line_with_venv_and_pip():
+def test_its_commands_are_those_of_ci_and_fit_one_line():
+    assert len(README.splitlines()) <= 150
     for marker, option in (("demo command", ""), ("test command", " --upgrade-deps")):
         (line,) = block(marker).strip().splitlines()
         assert line.startswith(f"python3 -m venv .venv{option} && .venv/bin/pip install")
-
-
-def test_the_demo_needs_no_extra():
-    assert "install -q . &&" in block("demo command")
-
-
-def test_ci_runs_the_test_command_of_the_readme():
-    script = (ROOT / ".ci" / "run").read_text()
-    assert "<!-- test command -->" in script
-    assert "README.md" in script
-
-
-def test_changelog_has_a_place_for_what_is_new():
-    text = (ROOT / "CHANGELOG.md").read_text()
-    assert "## [Unreleased]" in text
-    assert "### Added" in text
+    assert "install -q . &&" in block("demo command"), "the demo needs no extra"
+    assert "<!-- test command -->" in (ROOT / ".ci" / "run").read_text()
+    assert "## [Unreleased]" in (ROOT / "CHANGELOG.md").read_text()

@@ -21,14 +21,16 @@ _log = logging.getLogger(__name__)
 
 #: The description of a LeRobot dataset, in its folder.
 DATASET = Path("meta") / "info.json"
+#: Bytes of a whole path, and characters of an attribute of a URDF, which may be a path.
+LONGEST_PATH = 4095
+#: Levels of tables and lists, and of nested elements of a URDF.
+DEEPEST = 100
 #: Files of results, which name the other files that were written with them.
 _RECORDS = ("result.json", "track.json", "fleet.json")
 _PAGES = ("report.html", "replay.html")  # beside a result
 _MARKS = 10**6  # [ns] of a modification time that are a mark
 _LONGEST = 255  # bytes of a file's name
-_LONGEST_PATH = 4095  # bytes of a whole path
 _SHOWN = 60  # characters of a name in a message
-_DEEPEST = 40  # levels of tables and lists
 
 
 def check_path(path: str | Path) -> None:
@@ -37,10 +39,10 @@ def check_path(path: str | Path) -> None:
         raw = os.fsencode(path)
     except UnicodeEncodeError:
         raw = b"\0"
-    if b"\0" in raw or len(raw) > _LONGEST_PATH:
+    if b"\0" in raw or len(raw) > LONGEST_PATH:
         raise SettingsError(
             f"{str(path)[:_SHOWN]!r} is not a valid path, wanted UTF-8 without NUL, at most "
-            f"{_LONGEST_PATH} bytes"
+            f"{LONGEST_PATH} bytes"
         )
     name = max(raw.split(os.fsencode(os.sep)), key=len)
     if len(name) > _LONGEST:
@@ -263,13 +265,13 @@ def read_json(path: str | Path, what: str) -> Any:  # noqa: ANN401
             f"{source.name} is not JSON: {str(error)[:200]}; wanted a {what}"
         ) from error
     inside = [content]
-    for _ in range(_DEEPEST):
+    for _ in range(DEEPEST):
         lists = [
             x.values() if isinstance(x, dict) else x for x in inside if isinstance(x, dict | list)
         ]
         inside = [x for entries in lists for x in entries]
     if inside:
-        raise DataError(f"{source.name} has more than {_DEEPEST} levels: it is not a {what}")
+        raise DataError(f"{source.name} has more than {DEEPEST} levels: it is not a {what}")
     return content
 
 

@@ -18,9 +18,8 @@ from robotid.cli.flags import JOB, ROBOT, Flags, add_json, add_progress, job_fro
 from robotid.cli.job import Job, as_job
 from robotid.cli.logs import result_run
 from robotid.data.log import Log
-from robotid.design.basis import Basis, BSplineBasis, FourierBasis
 from robotid.design.clearance import Box, Clearance
-from robotid.design.design import Design, Designer
+from robotid.design.design import Design, Designer, FourierBasis
 from robotid.design.excitation import (
     FARTHEST,
     ROUTES,
@@ -90,13 +89,6 @@ def excite(
     return content
 
 
-def _basis(settings: MotionSettings) -> Basis:
-    """Return the basis functions of the motion."""
-    if settings.kind == "bspline":
-        return BSplineBasis(settings.duration, 2 * settings.harmonics)
-    return FourierBasis(settings.duration, settings.harmonics)
-
-
 def _designer(
     job: Job, settings: MotionSettings, given: str | Path | None
 ) -> tuple[Designer, Run | None]:
@@ -127,10 +119,10 @@ def _designer(
         clearance = Clearance(
             model, least=settings.clearance, floor=settings.floor, boxes=settings.boxes
         )
+    basis = FourierBasis(settings.duration, settings.harmonics)
     designer = Designer.of_model(
-        model, _basis(settings), limits, name=name, clearance=clearance, noise=settings.noise,
-        run=run,
-    )  # fmt: skip
+        model, basis, limits, name=name, clearance=clearance, noise=settings.noise, run=run
+    )
     return designer, run
 
 

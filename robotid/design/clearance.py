@@ -24,7 +24,7 @@ from robotid.robot.model import RobotModel
 #: Distance whose violation has the cost of a whole limit of the motion [m]; links that are farther
 #: apart in all random poses are checked in the end only.
 SOFT = 0.05
-#: Random poses by which the pairs of links that may meet are found, and static ones chosen.
+#: Random poses by which the pairs of links that may meet are found, and postures are chosen.
 POSES = 400
 _ALMOST_ALL = 0.95  # share of the poses
 _TOUCH = 1e-3  # [m] hulls at a smaller distance touch; a flat shape has this thickness

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import scipy.linalg
 
-from robotid.base.exceptions import NotConvergedError
+from robotid.base.exceptions import NotConvergedError, SettingsError
 from robotid.base.typing import Array
-from robotid.design.basis import Basis, DesignedMotion
 from robotid.design.clearance import SOFT, Clearance, Contact, Nearness
 from robotid.design.information import MotionInformation, MotionRows, criterion
 from robotid.design.limits import Course, MotionLimits, Postures
@@ -52,6 +52,66 @@ _SHARE = 1e-3  # ... to this accuracy, or as near to a limit
 _TYPICAL = 0.3  # of the largest torque, speed and acceleration: about the RMS of a motion
 _WIDEST = 0.25  # share of the base parameters in the criterion "widest"
 _STARTED = 10  # random motions of which the best is a start
+
+
+@dataclass(frozen=True)
+class FourierBasis:
+    """Sines and cosines of the first harmonics of 1 / duration, at rest at both ends.
+
+    The first function is constant 1. Two of the 2 h coefficients of a joint are fixed by the ends:
+    sum k s_k = 0 makes its velocity 0 there, and sum k^2 c_k = 0 its acceleration.
+
+    References:
+        Swevers et al. (1997), Optimal robot excitation and identification.
+    """
+
+    duration: float  # [s]
+    harmonics: int = 5
+
+    def __post_init__(self) -> None:
+        if self.harmonics < 2:
+            raise SettingsError(
+                f"harmonics is {self.harmonics}, wanted 2 or more: one cannot start at rest"
+            )
+
+    @property
+    def size(self) -> int:
+        """Number of functions."""
+        return 2 * self.harmonics - 1
+
+    @property
+    def shortest(self) -> float:
+        """Shortest period [s]."""
+        return self.duration / self.harmonics
+
+    @cached_property
+    def _free(self) -> Array:
+        """The sums of sines and cosines that are at rest at the ends, shape (2 h, 2 h - 2)."""
+        k, none = np.arange(1.0, self.harmonics + 1), np.zeros(self.harmonics)
+        return np.asarray(scipy.linalg.null_space([np.r_[k, none], np.r_[none, k**2]]))
+
+    def derivatives(self, t: Array, order: int) -> Array:
+        """Return the functions and their derivatives, shape (order + 1, N, size): t (N,) [s]."""
+        w = 2 * np.pi / self.duration * np.arange(1, self.harmonics + 1)
+        turn = np.exp(1j * np.outer(t, w))
+        out = np.empty((order + 1, len(t), self.size))
+        for d in range(order + 1):
+            waves = turn * (1j * w) ** d
+            out[d, :, 0] = float(d == 0)
+            out[d, :, 1:] = np.hstack([waves.imag, waves.real]) @ self._free
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class DesignedMotion(Motion):
+    """A motion q(t) = Phi(t) C."""
+
+    basis: FourierBasis  # the functions Phi of time
+    coefficients: Array  # C, shape (size, n) [rad or m]
+
+    def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
+        q, v, a = self.basis.derivatives(t, 2) @ self.coefficients
+        return q, v, a
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +195,7 @@ class Designer:
 
     information: MotionInformation  # the rows of the base problem, and their gradient
     limits: MotionLimits  # the robot's limits
-    basis: Basis  # basis functions of the motion
+    basis: FourierBasis  # basis functions of the motion
     noise: Array  # (n,), density: variance times its correlation time [(N m)^2 s or N^2 s]
     spread: Array  # prior deviations of the base parameters, shape (b,)
     given: Array | None = None  # prior information, shape (b, b), in units of the spread; 1 if None
@@ -147,7 +207,7 @@ class Designer:
     def of_model(
         cls,
         model: RobotModel,
-        basis: Basis,
+        basis: FourierBasis,
         limits: MotionLimits,
         *,
         name: str = "D",

@@ -41,14 +41,14 @@ class MotionSettings(Settings):
     kind: str = setting(
         "fourier",
         "kind of motion: sweeps for friction, stands for gravity; default: fourier",
-        among=("fourier", "bspline", *ROUTES),
+        among=("fourier", *ROUTES),
     )
     duration: float = setting(
-        10.0, "length [s] of fourier and bspline motions", within=_from(0.1, 3600.0, " s")
+        10.0, "length [s] of a fourier motion", within=_from(0.1, 3600.0, " s")
     )
     harmonics: int = setting(
         5,
-        "harmonics of the Fourier series; B-splines have twice as many pieces",
+        "harmonics of the Fourier series",
         within=_from(2, 100),
     )
     criterion: str | None = setting(

@@ -16,7 +16,8 @@ from robotid.robot.model import RobotModel
 
 #: The optimality criteria.
 CRITERIA = ("D", "A", "E", "condition", "widest")
-_STEP = 1e-6  # of the finite differences of drive columns, in their argument's scale
+#: Of the finite differences of drive columns, in their argument's scale.
+_STEP = np.finfo(float).eps ** (1 / 3)
 _REVERSAL = 0.01  # [rad/s or m/s] speed over which the sign of friction changes
 
 

@@ -10,15 +10,14 @@ import numpy as np
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
-from robotid.design.clearance import SOFT, Clearance, Contact
+from robotid.design.clearance import POSES, SOFT, Clearance, Contact
 from robotid.design.information import MotionInformation
 from robotid.robot.model import RobotModel
 
 #: The limited quantities, in the order of ``MotionLimits.sizes``.
 LIMITS = ("position", "velocity", "acceleration", "jerk", "torque", "power")
 _FREE = np.pi  # [rad] half the range of a continuous joint
-_TRIED = 200  # random postures tried for one that the robot can hold ...
-_AT_ONCE = 10  # ... so many at a time
+_AT_ONCE = 10  # random postures tried at a time for one that the robot can hold
 _REPAIRS = 300  # joints that are redrawn of a posture that violates a limit, one after another
 _SAMPLES = 1000  # samples at which distances are computed
 _FEW = 20  # samples by which the changing distances are found ...
@@ -102,7 +101,7 @@ class Postures:
     limits: MotionLimits  # the robot's limits
     clearance: Clearance | None = None  # the distances to collisions; None: they are not checked
 
-    def resting(self, rng: np.random.Generator, tried: int = _TRIED) -> Array:
+    def resting(self, rng: np.random.Generator, tried: int = POSES) -> Array:
         """Return the random postures that satisfy limits and distances at rest, shape (k, n)."""
         q = self._drawn(rng, tried)
         possible = q[self.can_rest(q)]
@@ -140,7 +139,7 @@ class Postures:
 
     def one(self, rng: np.random.Generator) -> Array:
         """Return the first of ``resting``, which are tried a few at a time, shape (n,)."""
-        for _ in range(_TRIED // _AT_ONCE):
+        for _ in range(POSES // _AT_ONCE):
             q = self._drawn(rng, _AT_ONCE)
             possible = q[self.can_rest(q)]
             if len(possible):

@@ -25,14 +25,14 @@ class Rule:
     most: int  # Largest number of options selected
     share: float  # Smallest share of the squared residual of a selected option [-]
     p_value: float | None  # Largest p-value of a selected option [-]; None: it is not tested
-    alike: float  # Share of the squared residual within which options count as equal [-]
+    #: Share of the squared residual within which options count as equal, the simpler is selected.
+    alike: float = 0.02
 
 
-_ALIKE = 0.02  # of the squared residual: within this difference the simpler option is selected
 # Families selected for a joint's drive: benchmarks/bench_friction.py
 # The same p-value decides whether least squares predicts better than bodies bound to the prior.
 FAMILY_P_VALUE = 0.01
-FAMILY = Rule(most=4, share=0.05, p_value=FAMILY_P_VALUE, alike=_ALIKE)
+FAMILY = Rule(most=4, share=0.05, p_value=FAMILY_P_VALUE)
 # Families selected from simulated positions, one of each at most, by the share of a joint's squared
 # residual in held-out windows with unit noise: benchmarks/bench_commands.py
 SIMULATED_FAMILY = Rule(most=3, share=0.02, p_value=None, alike=0.0)
@@ -48,7 +48,7 @@ AT_BOUND = 0.02
 #: quantity must explain, and the largest p-value of that share.
 LEAST_SHARE, P_VALUE = 0.1, 3e-4
 # Terms that a drive model lacks: benchmarks/bench_misfit.py
-MISFIT = Rule(most=3, share=LEAST_SHARE, p_value=P_VALUE, alike=_ALIKE)
+MISFIT = Rule(most=3, share=LEAST_SHARE, p_value=P_VALUE)
 #: Share of the squared residual above which a term is a warning.
 MISFIT_WARNS = 0.25
 #: Size over the torque above which a term is reported, and above which it is a warning.
@@ -63,7 +63,7 @@ MAIN = 50.0
 GROWN = 1.3
 # Recordings or URDF that differ from what was stated: benchmarks/bench_verdict.py. Only the best
 # hypothesis is tested.
-ALTERATION = Rule(most=3, share=-float("inf"), p_value=None, alike=_ALIKE)
+ALTERATION = Rule(most=3, share=-float("inf"), p_value=None)
 #: A smaller share is also reported if validation logs confirm it fully, its p-value is tiny and its
 #: size is twice the one that changes a result: it biases masses even if noise hides it.
 WEAK, WEAK_P_VALUE, WEAK_SIZE = 0.03, 1e-5, 2.0
@@ -88,6 +88,12 @@ ROUNDING, STEP = 1e-10, 1e-3
 #: Size of the correlation from which two parameters or signals are strongly correlated: if one were
 #: known, the error of the other would be less than a third of what it is, sqrt(1 - r^2) = 0.31.
 CORRELATED = 0.95
+#: Relative difference up to which two values agree: as a mass or a gravity torque confirms the
+#: torque scale; and from which one is reported, or a standard error is too large to use a value.
+AGREES = 0.05
+DIFFERS = 2 * AGREES
+#: Factor beyond which a torque or a total mass is no error of the URDF's masses.
+NO_ERROR_OF_MASSES = 3.0
 #: Segments from which a scatter is determined.
 SCATTERED = 3
 #: A sum of squares that is 0, as a divisor.
@@ -174,3 +180,12 @@ def _student(before: Array, after: Array) -> float:
     gain = (before - after)[moves] / np.maximum(before, after)[moves]
     spread = max(float(np.std(gain, ddof=1)) / np.sqrt(len(gain)), NOTHING)
     return float(stdtr(len(gain) - 1, -gain.mean() / spread))
+
+
+def connected(is_alike: Array) -> list[list[int]]:
+    """Return the groups of several indices that a symmetric relation connects: (n, n)."""
+    from scipy.sparse.csgraph import connected_components
+
+    count, label = connected_components(is_alike)
+    groups = [np.flatnonzero(label == k).tolist() for k in range(count)]
+    return [group for group in groups if len(group) > 1]

@@ -162,57 +162,52 @@ class WorkPlan:
     def run(
         self, work: Work, pieces: Iterable[tuple[int, Workload]], lost: Lost | None = None
     ) -> Iterator[tuple[int, Any]]:
-        """Yield the results of pieces with their indices; closing the iterator ends the work."""
+        """Yield the results of pieces with their indices; closing the iterator ends the work.
+
+        At most two pieces per worker are submitted. If a worker ends, the pieces under way are
+        repeated one after the other, so that the piece that ends its worker is known.
+        """
+        waiting = iter(pieces)
+        running: dict[Future[_Outcome], tuple[int, Workload]] = {}
         try:
-            yield from self._collect(work, iter(pieces), lost)
+            while True:
+                free = max(0, 2 * max(1, self._count()) - len(running))
+                for index, piece in islice(waiting, free):
+                    with _interrupts_deferred():
+                        running[self._submit(work, piece)] = index, piece
+                if not running:
+                    return
+                future = self._finished(running)
+                index, piece = running.pop(future)
+                result, messages = self._outcome(future, work, piece, lost)
+                for name, level, text in messages:
+                    logging.getLogger(name).log(level, "%s", text)
+                yield index, result
         except BaseException:
             self.close(is_urgent=True)
             raise
 
-    def _collect(
-        self, work: Work, waiting: Iterator[tuple[int, Workload]], lost: Lost | None
-    ) -> Iterator[tuple[int, Any]]:
-        """Yield results, with at most two submitted pieces per worker.
-
-        If a worker ends, the pieces under way are repeated one after the other, so that the piece
-        that ends its worker is known.
-        """
-        running: dict[Future[_Outcome], tuple[int, Workload]] = {}
-        while True:
-            for index, piece in islice(waiting, max(0, 2 * max(1, self._count()) - len(running))):
-                with _interrupts_deferred():
-                    running[self._submit(work, piece)] = index, piece
-            if not running:
-                return
-            future = self._finished(running)
-            index, piece = running.pop(future)
+    def _outcome(
+        self, future: Future[_Outcome], work: Work, piece: Workload, lost: Lost | None
+    ) -> _Outcome:
+        """Return a finished piece, repeated alone while its worker ends, or what replaces it."""
+        attempts = _ATTEMPTS[self.scheduler is not None]
+        for left in reversed(range(attempts)):
             try:
-                result, messages = future.result()
-            except CancelledError as error:
+                return future.result()
+            except CancelledError as again:
                 raise WorkerError(
                     f"the connection ended while {piece.name} was processed"
-                ) from error
-            except Exception as error:
-                if not _is_of_worker(error):
-                    raise
-                result, messages = self._repeated(work, piece, error, lost)
-            for name, level, text in messages:
-                logging.getLogger(name).log(level, "%s", text)
-            yield index, result
-
-    def _repeated(
-        self, work: Work, piece: Workload, error: Exception, lost: Lost | None
-    ) -> _Outcome:
-        """Process a piece alone after its worker ended; return what replaces its result if lost."""
-        attempts = _ATTEMPTS[self.scheduler is not None]
-        for _ in range(1, attempts):
-            _log.warning("a worker ended; %s is repeated", piece.name)
-            try:
-                return self._finished([self._submit(work, piece)]).result()
+                ) from again
             except Exception as again:
-                if not _is_of_worker(again):
-                    raise
+                if not (
+                    isinstance(again, BrokenExecutor) or type(again).__name__ == "KilledWorker"
+                ):
+                    raise  # not the end of a worker, of processes or of Dask
                 error = again
+            if left:
+                _log.warning("a worker ended; %s is repeated", piece.name)
+                future = self._finished([self._submit(work, piece)])
         failure = WorkerError(
             f"a worker ended during its work (killed, or out of memory), in each of {attempts} "
             f"attempts. Unfinished piece: {piece.name}"
@@ -334,11 +329,6 @@ def noted(note: str) -> Iterator[None]:
     except Exception as error:
         error.add_note(note)
         raise
-
-
-def _is_of_worker(error: Exception) -> bool:
-    """Return whether an error says that a worker ended."""
-    return isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker"  # Dask's
 
 
 @contextmanager

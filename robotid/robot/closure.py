@@ -14,7 +14,7 @@ _CLOSED = 1e-6  # largest error of a closed loop, relative to the length of the 
 _MOST = 30  # iterations of Newton's method
 # square root of the rounding error: the step with which Newton's method ends [rad, m], as the error
 # is about its square; and the share of the largest singular value below which loops are dependent
-_PRECISE = 1e-8
+_PRECISE = np.sqrt(np.finfo(float).eps)
 _REGULAR = 1e-6  # ... below which columns of a loop are dependent
 _DEAD = 1e-4  # ... and positions that loops determine, relative to the length of the robot
 _PATH = 25  # steps from the zero position to the first one

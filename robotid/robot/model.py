@@ -1,13 +1,8 @@
 """The robot: a kinematic tree with Pinocchio's dynamics and named standard parameters."""
 
 import math
-import os
-import sys
-import tempfile
-import threading
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,16 +19,19 @@ from robotid.robot.constraints import Constraint, Contact, Loop, check_constrain
 from robotid.robot.drive_term import DriveMotion, DriveTerm
 from robotid.robot.drives import DRIVE_TERMS, TERMS
 from robotid.robot.parameters import DYNAMICS, Coupling, ParameterLayout
-from robotid.robot.tree import Joint, Tree, choose_joints, mimic_followers, read_tree
+from robotid.robot.tree import (
+    SMALLEST_LENGTH,
+    Joint,
+    Tree,
+    choose_joints,
+    mimic_followers,
+    read_tree,
+)
 from robotid.robot.urdf_text import LARGEST
 
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
-_OFFSET = 0.01  # [m] axes that are nearer have no distance: 78 URDFs have 0.05 m or more, or 0.5 mm
 _STRONGEST = 100.0  # [m/s^2] with more, accelerations are negligible beside gravity
 _UNIT = 1e-6  # tolerance of the norm of a quaternion
-_ONE_AT_A_TIME = threading.Lock()
-_KINDS = ("Error:", "Warning:")  # first word of console_bridge's messages, which urdfdom uses
-_PLACE = "         at line "  # the second line of such a message: a line of urdfdom's source
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,7 +262,7 @@ class RobotModel:
         """
         placements = self.pin_model.jointPlacements[1:]
         longest = max(float(np.linalg.norm(placement.translation)) for placement in placements)
-        return longest if longest > _OFFSET else 1.0
+        return longest if longest > SMALLEST_LENGTH else 1.0
 
     @property
     def carried_by(self) -> Array:
@@ -482,15 +480,19 @@ def _build(tree: Tree, free_flyer: bool, gravity: Sequence[float]) -> pin.Model:
                 f"{Path(tree.path).name}: a joint is named {name!r}, which is reserved by "
                 "Pinocchio; rename it"
             )
-    refused = ""
-    with caught_messages() as messages:
-        try:
-            model = pin.buildModelFromXML(tree.xml, *root)
-        except (ValueError, RuntimeError) as error:
-            refused = str(error)
-    if refused or messages:  # it omits the elements of its messages
-        text = "; ".join([*messages, *([refused] if refused else [])])
-        raise ModelError(f"{Path(tree.path).name}: Pinocchio cannot read it: {text}")
+    try:
+        model = pin.buildModelFromXML(tree.xml, *root)
+    except (ValueError, RuntimeError) as error:
+        raise ModelError(f"{Path(tree.path).name}: Pinocchio cannot read it: {error}") from error
+    lost = [link for link in tree.links if not model.existBodyName(link)]
+    lost += [joint.name for joint in tree.movable if not model.existJointName(joint.name)]
+    mass = sum(inertia.mass for inertia in model.inertias)
+    stated = sum(inertial.mass for inertial in tree.inertials.values())
+    if lost or not math.isclose(mass, stated, rel_tol=1e-9):  # it omits what it cannot read
+        raise ModelError(
+            f"{Path(tree.path).name}: Pinocchio cannot read it: its model lacks {listed(lost)}, "
+            f"and has {mass:g} kg, wanted {stated:g} kg"
+        )
     model.gravity.linear = acceleration
     return model
 
@@ -533,33 +535,3 @@ def _velocity_map(
         G[joint.idx_v, base + moving.index(leader)] = ratio
         shift[joint.idx_v] = offset
     return G, shift
-
-
-@contextmanager
-def caught_messages() -> Iterator[list[str]]:
-    """Catch the messages that urdfdom and Pinocchio print on file descriptor 2."""
-    messages: list[str] = []
-    with _ONE_AT_A_TIME, tempfile.TemporaryFile() as caught:
-        try:
-            stderr = os.dup(2)
-        except OSError:  # no stderr: nothing can be printed there
-            yield messages
-            return
-        if sys.stderr is not None:
-            sys.stderr.flush()
-        os.dup2(caught.fileno(), 2)
-        try:
-            yield messages
-        finally:
-            os.dup2(stderr, 2)
-            os.close(stderr)
-        caught.seek(0)
-        others = []
-        for line in caught.read().decode(errors="replace").splitlines():
-            kind, _, text = line.partition(" ")
-            if kind in _KINDS:
-                messages.append(text.strip())
-            elif not line.startswith(_PLACE):
-                others.append(f"{line}\n")
-        if others:
-            os.write(2, "".join(others).encode())

@@ -18,6 +18,7 @@ from robotid.robot.geometry import BEYOND_FRAMES, body_frames, body_points
 from robotid.robot.mass_matrix import carried_inertia
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
+from robotid.robot.tree import SMALLEST_LENGTH
 
 _SMALLEST_MASS = 0.1  # of the mean mass: deviation of a link's mass even if its URDF states 0
 _POSITIONS = 16  # of a revolution at which terms that depend on the position are evaluated
@@ -30,7 +31,6 @@ REASONS = MappingProxyType({
     "inertial_units": "masses or lengths in another unit than kg and m",
 })  # fmt: skip
 _DENSITY = 1000.0  # [kg/m^3] without a body to take it from
-_LEAST_SIDE = 0.01  # [m] thin sheets have a volume
 _SLACK = 1e-9  # relative violation of positive definiteness that is rounding
 _COPIES = 3  # identical isotropic inertials are placeholders
 # medians over the bodies of all robots in example-robot-data: at most 2e4 kg/m^3 and 7
@@ -196,4 +196,4 @@ def _placeholders(model: RobotModel) -> set[str]:
 def _grown(points: Array, half_width: float) -> tuple[Array, Array]:
     """Return centre and sides of the box around points, enlarged on each side [m]."""
     low, high = points.min(axis=0), points.max(axis=0)
-    return 0.5 * (low + high), np.maximum(high - low + 2.0 * half_width, _LEAST_SIDE)
+    return 0.5 * (low + high), np.maximum(high - low + 2.0 * half_width, SMALLEST_LENGTH)

@@ -21,6 +21,8 @@ from robotid.robot.urdf_text import LARGEST, parse_urdf, read_numbers, write_exa
 
 #: The types of joint that have a degree of freedom.
 MOVABLE = ("revolute", "continuous", "prismatic")
+#: Smallest distance of axes, and side of a body [m]: URDFs have 0.05 m or more, or 0.5 mm.
+SMALLEST_LENGTH = 0.01
 _ENDLESS = 200.0  # [rad or m] range that counts as no limit: no cable allows 30 revolutions
 #: Attributes of an ``<inertia>``, in the order of ``Inertial.inertia``.
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")

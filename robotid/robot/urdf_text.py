@@ -15,15 +15,13 @@ from typing import Any
 from xml.parsers import expat
 
 from robotid.base.exceptions import ModelError
-from robotid.base.files import missing_file
+from robotid.base.files import DEEPEST, LONGEST_PATH, missing_file
 
 #: Largest absolute value of numbers, SI units: squares and products of them stay finite.
 LARGEST = 1e9
 _BLANKS = " \t\n\r\f\v"  # that separate numbers
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MOST_BYTES = 2**26  # of a file; that of a robot with a thousand links has 2**20
-_DEEPEST = 100  # nested elements; other readers of XML allow 256
-_LONGEST = 4096  # characters of an attribute, as many as a path may have
 _EXACT = 1e-7  # [rad] an angle within this of a multiple of pi/12 counts as exact
 _NEAR = 2e-5  # [rad] one within this (0.001 degrees) counts as rounded, not as calibrated
 
@@ -59,7 +57,7 @@ def parse_urdf(path: str | Path) -> ET.Element:
         ) from error
     if robot.tag != "robot":
         raise ModelError(
-            f"{path.name}: the top element is <{robot.tag[:_LONGEST]}>, wanted <robot>"
+            f"{path.name}: the top element is <{robot.tag[:LONGEST_PATH]}>, wanted <robot>"
         )
     _check_bounds(robot, path.name)
     return robot
@@ -169,16 +167,16 @@ def _check_bounds(robot: ET.Element, where: str) -> None:
     level, depth = [robot], 0
     while level:
         level, depth = [child for element in level for child in element], depth + 1
-        if depth > _DEEPEST:
+        if depth > DEEPEST:
             raise ModelError(
-                f"{where}: elements are nested {depth} levels deep, wanted at most {_DEEPEST}; a "
+                f"{where}: elements are nested {depth} levels deep, wanted at most {DEEPEST}; a "
                 "URDF needs six"
             )
     for element, key, text in _attributes(robot):
-        if len(text) > _LONGEST:
+        if len(text) > LONGEST_PATH:
             raise ModelError(
                 f"{where}: <{element.tag[:80]}>: {key[:80]} has {len(text)} characters, wanted at "
-                f"most {_LONGEST}; it starts with {_shown(text)}"
+                f"most {LONGEST_PATH}; it starts with {_shown(text)}"
             )
 
 

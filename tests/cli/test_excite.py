@@ -162,7 +162,7 @@ def test_a_format_that_motions_are_not_written_in_is_refused_before_the_design(t
 def test_every_flag_states_its_setting():
     """Each with a value that is not the default, two where the flag is repeatable."""
     words = {
-        "kind": "bspline", "duration": "4", "harmonics": "3", "criterion": "E", "share": "0.5",
+        "kind": "sweeps", "duration": "4", "harmonics": "3", "criterion": "E", "share": "0.5",
         "clearance": "0.1", "floor": "-0.2", "seed": "7", "starts": "2", "seconds": "9",
         "points": "50",
     }  # fmt: skip
@@ -180,7 +180,7 @@ def test_every_flag_states_its_setting():
     found = stated_by_flags(*line)
     each = {"one": 3.0, "two": 0.5}
     assert found == MotionSettings(
-        kind="bspline", duration=4.0, harmonics=3, criterion="E", share=0.5, clearance=0.1,
+        kind="sweeps", duration=4.0, harmonics=3, criterion="E", share=0.5, clearance=0.1,
         floor=-0.2, seed=7, starts=2, seconds=9.0, points=50.0,
         velocity=each, torque=each, acceleration=each, jerk=each, power=each, noise=each,
         boxes=(Box("post", (0, 1, 2), (3, 4, 5)), Box("wall", (-1, 0, 0), (0, 1, 1))),

@@ -3,9 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robotid.design.basis import BSplineBasis, FourierBasis
+from robotid.base.exceptions import SettingsError
 from robotid.design.clearance import Box, Clearance
-from robotid.design.design import Designer, Multipliers, State
+from robotid.design.design import DesignedMotion, Designer, FourierBasis, Multipliers, State
 from robotid.design.limits import LIMITS, MotionLimits
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
@@ -73,7 +73,7 @@ def test_a_design_keeps_its_limits_between_its_instants(wrist, designer, design)
 
 
 def test_designs_are_the_same_under_a_seed_and_stop_when_told(designer):
-    short = replace(designer, basis=BSplineBasis(4.0, 5))
+    short = replace(designer, basis=FourierBasis(4.0, 2))
     told = []
     one, other = (
         short.design(np.random.default_rng(3), starts=1, seconds=0.0, progress=progress)
@@ -141,3 +141,22 @@ def test_a_design_keeps_clear_of_what_stands_around(wrist, designer):
     t = np.linspace(0.0, 4.0, 4001)
     near = around.near(around.placed(found.motion.evaluate(t)[0]), 0.05, around.everything)
     assert (near.distance.min(axis=1) >= around.required).all()
+
+
+def test_motions_begin_and_end_at_rest_and_their_derivatives_are_true(rng):
+    basis = FourierBasis(7.0, 4)
+    assert basis.shortest == pytest.approx(1.75)
+    t = np.linspace(0.0, 7.0, 4001)
+    D = basis.derivatives(t, 3)
+    assert D.shape == (4, 4001, basis.size)
+    np.testing.assert_array_equal(D[:, :, 0], np.eye(4)[0][:, None] * np.ones(4001))
+    assert np.abs(D[1:3, [0, -1]]).max() < 1e-12
+    for k in range(3):
+        slope = np.gradient(D[k], t, axis=0)[2:-2]
+        np.testing.assert_allclose(slope, D[k + 1][2:-2], atol=3e-3 * np.abs(D[k + 1]).max())
+    assert np.linalg.matrix_rank(D[0]) == basis.size
+    C = rng.standard_normal((basis.size, 3))
+    q, v, a = DesignedMotion(basis, C).evaluate(t)
+    np.testing.assert_allclose((q, v, a), D[:3] @ C)
+    with pytest.raises(SettingsError, match="harmonics is 1, wanted 2 or more"):
+        FourierBasis(5.0, 1)

@@ -6,7 +6,7 @@ import yaml
 
 from robotid.data.files.formats import open_table
 from robotid.data.signal_settings import LogSource
-from robotid.design.basis import DesignedMotion, FourierBasis
+from robotid.design.design import DesignedMotion, FourierBasis
 from robotid.design.excitation import write_motion
 
 JOINTS = tuple(f"joint_{k}" for k in range(6))

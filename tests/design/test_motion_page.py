@@ -3,9 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robotid.design.basis import FourierBasis
 from robotid.design.clearance import Box, Clearance
-from robotid.design.design import Designer
+from robotid.design.design import Designer, FourierBasis
 from robotid.design.limits import LIMITS, MotionLimits
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

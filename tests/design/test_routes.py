@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from robotid.design import routes
-from robotid.design.basis import FourierBasis
 from robotid.design.clearance import Clearance
-from robotid.design.design import Designer
+from robotid.design.design import Designer, FourierBasis
 from robotid.design.limits import LIMITS, MotionLimits
 from robotid.design.routes import _PLACES, Route, _free_range, design_stands, design_sweeps
 from robotid.robot.examples import example_urdf

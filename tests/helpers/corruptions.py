@@ -1,7 +1,7 @@
 """Ways to spoil a clean log, with the codes of the finding that must name each."""
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, reduce
 
 import numpy as np
 
@@ -67,18 +67,18 @@ def table_of(log: Log):
     return columns
 
 
-def column(name, function):
-    return lambda table: {**table, name: function(table[name].copy(), table["time"])}
+def column(prefix, function):
+    """Change the columns that begin so by a function of values and time."""
+    return lambda table: {
+        name: function(x.copy(), table["time"]) if name.startswith(prefix) else x
+        for name, x in table.items()
+    }
 
 
 def swap(*pairs):
-    def change(table):
-        changed = dict(table)
-        for a, b in pairs:
-            changed[a], changed[b] = table[b], table[a]
-        return changed
-
-    return change
+    return lambda table: (
+        table | {name: table[other] for a, b in pairs for name, other in ((a, b), (b, a))}
+    )
 
 
 def rows(function):
@@ -86,21 +86,11 @@ def rows(function):
 
 
 def scaled(prefix, factor):
-    return lambda table: {
-        name: values * factor if name.startswith(prefix) else values
-        for name, values in table.items()
-    }
+    return column(prefix, lambda x, _t: x * factor)
 
 
 def late(prefix, delay):
-    def change(table):
-        t = table["time"]
-        return {
-            name: np.interp(t - delay, t, values) if name.startswith(prefix) else values
-            for name, values in table.items()
-        }
-
-    return change
+    return column(prefix, lambda x, t: np.interp(t - delay, t, x))
 
 
 def without(name):
@@ -115,38 +105,20 @@ def set_rows(where, value):
     return function
 
 
-def frozen(x, _t):
-    return np.full_like(x, x[0])
-
-
 def both(*changes):
-    def change(table):
-        for one in changes:
-            table = one(table)
-        return table
-
-    return change
+    return lambda table: reduce(lambda changed, change: change(changed), changes, table)
 
 
 def held(prefix, length):
-    def change(table):
-        rows = np.arange(len(table["time"])) // length * length
-        return {name: x[rows] if name.startswith(prefix) else x for name, x in table.items()}
-
-    return change
+    return column(prefix, lambda x, _t: x[np.arange(len(x)) // length * length])
 
 
 def unsigned(prefix):
-    return lambda table: {
-        name: np.abs(x) if name.startswith(prefix) else x for name, x in table.items()
-    }
+    return column(prefix, lambda x, _t: np.abs(x))
 
 
-def noise(name):
-    def function(x, _t):
-        return x.std() * np.random.default_rng(0).standard_normal(len(x))
-
-    return column(name, function)
+def noise(x, _t):
+    return x.std() * np.random.default_rng(0).standard_normal(len(x))
 
 
 def differenced(bits, name):
@@ -177,22 +149,13 @@ def stepped(seconds):
 
 
 def stale(table):
-    held = np.arange(len(table["time"]))
-    held[1::5] -= 1  # every fifth row repeats the one before
-    return {name: x if name == "time" else x[held] for name, x in table.items()}
-
-
-def duplicated(x):
-    return np.insert(x, 500, x[500])
+    kept = np.arange(len(table["time"]))
+    kept[1::5] -= 1  # every fifth row repeats the one before
+    return {name: x if name == "time" else x[kept] for name, x in table.items()}
 
 
 def exchanged(x, _t):
     x[[700, 701]] = x[[701, 700]]
-    return x
-
-
-def spiked(x, _t):
-    x[len(x) * np.arange(1, 10, 2) // 10] = 1000.0
     return x
 
 
@@ -221,7 +184,7 @@ CASES = {
     "one velocity halved": Case(("velocity_scale",), scaled("dq_elbow", 0.5)),
     "velocity in rpm": Case(("velocity_scale",), scaled("dq_", 9.5493)),
     "dead velocity channel": Case(("velocity_scale",), scaled("dq_elbow", 0.0)),
-    "one velocity replaced by noise": Case(("velocity_mismatch",), noise("dq_elbow_joint")),
+    "one velocity replaced by noise": Case(("velocity_mismatch",), column("dq_elbow_joint", noise)),
     "velocity of a 12-bit encoder": Case(("quantised",), differenced(12, "dq_elbow_joint")),
     "milliseconds": Case(("time_unit",), scaled("time", 1000)),
     "nanoseconds since 1970": Case(("time_unit",), column("time",
@@ -230,7 +193,8 @@ CASES = {
     "clock set by 2 s": Case(("clock_step",), stepped(2.0)),
     "NaN torque": Case(("not_finite",), column("tau_elbow_joint", set_rows(300, np.nan))),
     "NaN position": Case(("not_finite",), column("q_elbow_joint", set_rows(300, np.nan))),
-    "duplicate stamp": Case(("duplicate_stamp",), rows(duplicated)),
+    "duplicate stamp": Case(("duplicate_stamp",), rows(
+        lambda x: np.insert(x, 500, x[500]))),
     "swapped stamps": Case(("stamp_order",), column("time", exchanged)),
     "gap of 1 s": Case(("gap",), rows(
         lambda x: np.delete(x, slice(len(x) * 9 // 20, len(x) // 2)))),
@@ -246,7 +210,7 @@ CASES = {
     "one torque held for 3 rows": Case(("repeated_torque",), held("tau_elbow", 3)),
     "gravity-compensated torques": Case(("gravity_compensated",), compensated),
     "static joint": Case(("static_joint",), both(
-        column("q_wrist_3_joint", frozen), scaled("dq_wrist_3", 0))),
+        column("q_wrist_3_joint", lambda x, _t: np.full_like(x, x[0])), scaled("dq_wrist_3", 0))),
     "stale rows": Case(("stale_rows",), stale),
     "torque in coarse steps": Case(("quantised",), column("tau_wrist_2_joint",
         lambda x, _t: np.round(x / np.ptp(x) * 20) * np.ptp(x) / 20)),
@@ -263,7 +227,8 @@ CASES = {
     "missing torque column": Case(("missing_column",), without("tau_elbow_joint")),
     "position offset by 0.5 rad": Case(("position_offset",), column(f"q_{A}",
         lambda x, _t: x + 0.5)),
-    "five spikes of 1000 N m": Case(("spikes",), column("tau_elbow_joint", spiked)),
+    "five spikes of 1000 N m": Case(("spikes",), column("tau_elbow_joint",
+        lambda x, t: set_rows(len(x) * np.arange(1, 10, 2) // 10, 1000.0)(x, t))),
     "too few rows": Case(("too_short",), rows(lambda x: x[:30])),
 }
 # fmt: on

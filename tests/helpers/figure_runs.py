@@ -367,7 +367,6 @@ def design(folder):
     for kind, words in (
         ("fourier", "--duration 5 --harmonics 3 --points 50 --criterion E "
          f"{first} --report @fourier.html"),
-        ("bspline", f"--duration 4 --harmonics 2 --points 40 --criterion A {first}"),
         ("sweeps", around),
         ("stands", around),
     ):  # fmt: skip

@@ -4,10 +4,11 @@ As the kinds of ``hostile_inputs``, beside which these are.
 """
 
 import contextlib
+import inspect
 import io
 import warnings
 from collections import UserDict
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -48,102 +49,90 @@ def _online(model, t, q, tau):
     return online.is_ready
 
 
-#: By name: a function, and what makes its good arguments of the robot and an empty folder.
+def _coupled(name, ratios, replaces=False):
+    return RobotModel.from_urdf(URDF, couplings=[Coupling(name, ratios, replaces)])
+
+
+#: By name: a function, and good arguments beside its defaults, from the robot and an empty folder.
 CALLS = {
-    "Log": (Log, lambda c, _: _log_fields(c.log)),
-    "Log.window": (
-        lambda start, end: robot().log.window(start, end),
-        lambda c, _: {"start": 0.1, "end": 0.9},
-    ),
-    "Log.select": (lambda joints: robot().log.select(joints), lambda c, _: {"joints": JOINTS}),
+    "Log": (lambda c: Log, lambda c, _: _log_fields(c.log)),
+    "Log.window": (lambda c: c.log.window, lambda c, _: {"start": 0.1, "end": 0.9}),
+    "Log.select": (lambda c: c.log.select, lambda c, _: {"joints": JOINTS}),
     "Trajectory": (
-        Trajectory,
+        lambda c: Trajectory,
         lambda c, _: {"t": c.log.t[:60], "q": c.log.q[:60], "v": c.log.v[:60], "a": c.log.q[:60],
                       "tau": c.log.tau[:60], "joints": JOINTS, "rate": 50.0, "segment": c.segment},
     ),
-    "SignalSettings": (
-        SignalSettings,
-        lambda c, _: {"rate": 50.0, "cutoff": 8.0, "order": 4, "velocity": "auto", "trim": 0.1,
-                      "min_velocity": 0.02, "friction_band": 0.0, "max_gap": None,
-                      "acceleration": "auto", "torque_delay": 0.0, "velocity_delay": 0.0},
-    ),
-    "LogSource": (
-        LogSource,
-        lambda c, _: {"topic": None, "command": None, "joints": {}, "effort": "torque",
-                      "stamp": "header"},
-    ),
-    "LogUnits": (LogUnits, lambda c, _: {"time": "s", "angle": "rad"}),
+    "SignalSettings": (lambda c: SignalSettings, lambda c, _: {"rate": 50.0, "min_velocity": 0.02}),
+    "LogSource": (lambda c: LogSource, lambda c, _: {}),
+    "LogUnits": (lambda c: LogUnits, lambda c, _: {}),
     "EstimatorSettings": (
-        robotid.EstimatorSettings,
-        lambda c, _: {"name": "consistent", "margin": 1e-4, "prior": "entropic",
-                      "prior_weight": "auto", "constraints": {}, "robust": "none"},
+        lambda c: robotid.EstimatorSettings,
+        lambda c, _: {"name": "consistent", "prior_weight": "auto", "constraints": {},
+                      "robust": "none"},
     ),
     "from_urdf": (
-        RobotModel.from_urdf,
-        lambda c, _: {"path": URDF, "joints": JOINTS, "locked": {}, "free_flyer": False,
-                      "mimic": "independent", "gravity": (0.0, 0.0, -9.81), "terms": ("viscous",),
-                      "couplings": (), "own_terms": {}, "dynamics": "full", "snap_angles": False},
+        lambda c: RobotModel.from_urdf,
+        lambda c, _: {"path": URDF, "joints": JOINTS, "locked": {}, "gravity": (0.0, 0.0, -9.81),
+                      "terms": ("viscous",)},
     ),
-    "Coupling": (
-        lambda **given: RobotModel.from_urdf(URDF, couplings=[Coupling(**given)]),
-        lambda c, _: {"name": "c", "ratios": (("joint_1", 1.0),), "replaces": False},
-    ),
-    "inspect_urdf": (robotid.inspect, lambda c, _: {"path": URDF, "free_flyer": False}),
-    "check_logs": (
-        robotid.doctor,
-        lambda c, _: {"model": c.model, "logs": c.log, "validation": (), "signals": None},
-    ),
+    "Coupling": (lambda c: _coupled, lambda c, _: {"name": "c", "ratios": (("joint_1", 1.0),)}),
+    "inspect_urdf": (lambda c: robotid.inspect, lambda c, _: {"path": URDF}),
+    "check_logs": (lambda c: robotid.doctor, lambda c, _: {"model": c.model, "logs": c.log}),
     "read_log": (
-        robotid.read_log,
-        lambda c, _: {"path": good_result()[0] / "fit.csv", "joints": JOINTS, "gains": None,
-                      "columns": None, "start": None, "end": None, "units": LogUnits(),
-                      "prismatic": (), "source": LogSource(), "transmissions": (),
-                      "needs": "torque"},
+        lambda c: robotid.read_log,
+        lambda c, _: {"path": good_result()[0] / "fit.csv", "joints": JOINTS, "units": LogUnits(),
+                      "source": LogSource()},
     ),
-    "write_log": (robotid.write_log, lambda c, f: {"log": c.log, "path": f / "log.csv"}),
+    "write_log": (lambda c: robotid.write_log, lambda c, f: {"log": c.log, "path": f / "log.csv"}),
     "identify": (
-        robotid.identify,
-        lambda c, _: {"model": c.model, "logs": c.log, "validation": (), "signals": None,
-                      "estimator": "ols", "controller": None, "friction": "none", "doctor": False,
-                      "ignore": ()},
+        lambda c: robotid.identify,
+        lambda c, _: {"model": c.model, "logs": c.log, "estimator": "ols", "friction": "none",
+                      "doctor": False},
     ),
     "identify_payload": (
-        robotid.payload,
-        lambda c, _: {"model": c.model, "logs": c.log, "reference": c.log, "links": (),
-                      "masses": None, "unknown_gains": (), "signals": None, "friction": "none"},
+        lambda c: robotid.payload,
+        lambda c, _: {"model": c.model, "logs": c.log, "reference": c.log, "friction": "none"},
     ),
     "preview": (
-        robotid.preview,
+        lambda c: robotid.preview,
         lambda c, _: {"model": c.model, "motions": c.log, "noise": {"joint_1": 0.1},
-                      "signals": None, "estimator": "ols", "given": None},
+                      "estimator": "ols"},
     ),
     "predict": (
-        lambda **given: robot().found.predict(**given),
-        lambda c, _: {"q": c.log.q, "v": c.log.v, "a": c.log.q},
+        lambda c: c.found.predict, lambda c, _: {"q": c.log.q, "v": c.log.v, "a": c.log.q}
     ),
     "friction": (
-        lambda **given: robot().found.friction(**given),
+        lambda c: c.found.friction,
         lambda c, _: {"joint": "joint_1", "v": [0.1, 0.2], "q": 0.1, "load": 1.0},
     ),
-    "follow_commands": (
-        lambda **given: robot().result.follow_commands(**given), lambda c, _: {"log": c.log}
-    ),
+    "follow_commands": (lambda c: c.result.follow_commands, lambda c, _: {"log": c.log}),
     "save": (
-        lambda **given: robotid.save_result(robot().found, **given),
+        lambda c: partial(robotid.save_result, c.found),
         lambda c, f: {"folder": f / "saved", "report": False, "replay": False},
     ),
-    "load_result": (robotid.load_result, lambda c, _: {"path": good_result()[0]}),
+    "load_result": (lambda c: robotid.load_result, lambda c, _: {"path": good_result()[0]}),
     "replay": (
-        robotid.replay,
-        lambda c, _: {"model": c.model, "t": c.log.t[:60], "q": c.log.q[:60], "torques": None,
-                      "masses": None, "ghosts": None, "bands": None, "marks": (), "notes": (),
-                      "rate": 30.0},
+        lambda c: robotid.replay,
+        lambda c, _: {"model": c.model, "t": c.log.t[:60], "q": c.log.q[:60]},
     ),
     "OnlineIdentifier": (
-        _online,
+        lambda c: _online,
         lambda c, _: {"model": c.model, "t": 0.0, "q": c.log.q[0], "tau": c.log.tau[0]},
     ),
 }  # fmt: skip
+
+
+def good_call(name, folder):
+    """Return a function with all of its arguments, by name."""
+    call, given = CALLS[name][0](robot()), CALLS[name][1](robot(), folder)
+    defaults = {
+        key: x.default
+        for key, x in inspect.signature(call).parameters.items()
+        if x.default is not x.empty and key != "progress"
+    }
+    return call, defaults | given
+
 
 MASKED = np.ma.masked_array(np.zeros((200, 2)), mask=np.eye(200, 2, dtype=bool))
 
@@ -169,17 +158,16 @@ def odd_arguments(given):
 def calls(draw, names=tuple(CALLS)):
     """The name of a call, and which of its arguments are what else."""
     name = draw(st.sampled_from(names))
-    keys = sorted(CALLS[name][1](robot(), Path()))
+    keys = sorted(good_call(name, Path())[1])
     odd = st.integers(0, len(odd_arguments(robot())) - 1)
     return name, draw(st.dictionaries(st.sampled_from(keys), odd, min_size=1, max_size=2))
 
 
 def run_call(example, folder):
     name, changes = example
-    call, good = CALLS[name]
-    context = robot()
-    odd = odd_arguments(context)
-    arguments = good(context, folder) | {key: odd[place] for key, place in changes.items()}
+    odd = odd_arguments(robot())
+    call, good = good_call(name, folder)
+    arguments = good | {key: odd[place] for key, place in changes.items()}
     with (
         contextlib.chdir(folder),
         contextlib.redirect_stdout(io.StringIO()),

@@ -127,7 +127,7 @@ excite_flags = st.one_of(
     st.tuples(any_of("--max-acceleration --max-jerk --max-power --noise --lock"), of_joint),
     st.tuples(st.just("--box"), st.sampled_from(BOXES)),
 )
-kinds = st.sampled_from([["--kind", kind] for kind in ("fourier", "bspline", "sweeps", "stands")])
+kinds = st.sampled_from([["--kind", kind] for kind in ("fourier", "sweeps", "stands")])
 excitements = st.tuples(
     st.sampled_from([*["pan and tilt"] * 5, *sorted(ROBOTS)]),
     st.sampled_from([*["1"] * 8, "0", "1e-12", "1e9", "nan"]),  # masses [kg]

@@ -90,10 +90,10 @@ def charts(html):
         r'<figure class="chart">.*?<script type="application/json">(.*?)</script>', html, re.DOTALL
     ):
         what = json.loads(text)
-        what["x"] = _unpacked(what["x"])
+        what["x"] = unpacked(what["x"])
         for series in what["series"]:
-            series["y"] = _unpacked(series["y"])
-            series["half"] = None if series["half"] is None else _unpacked(series["half"])
+            series["y"] = unpacked(series["y"])
+            series["half"] = None if series["half"] is None else unpacked(series["half"])
         found.append(what)
     return found
 
@@ -104,7 +104,7 @@ def chart(html, title):
     return found
 
 
-def _unpacked(packed):
+def unpacked(packed):
     """Return the numbers of an array in a page, the last code as NaN."""
     codes = np.frombuffer(base64.b64decode(packed["data"]), f"<u{packed['bits'] // 8}")
     last = 2 ** packed["bits"] - 1

@@ -17,6 +17,7 @@ from unittest import mock
 
 import numpy as np
 
+from helpers.pages import unpacked as numbers_of
 from robotid.cli import main
 
 HERE = Path(__file__).resolve().parents[1] / "figures"
@@ -317,16 +318,6 @@ def told_columns(packed):
     columns = data.reshape(packed["shape"][0], -1).T
     told = [summary(column, _OF_CHART) for column in columns[:8]]
     return {"shape": packed["shape"], "columns": told}
-
-
-def numbers_of(packed):
-    """Return the numbers that a page packs, NaN for none."""
-    bits = packed["bits"]
-    codes = np.frombuffer(base64.b64decode(packed["data"]), dtype=f"<u{bits // 8}").astype(float)
-    last = 2**bits - 1
-    values = packed["low"] + codes / (last - 1) * (packed["high"] - packed["low"])
-    values[codes == last] = np.nan
-    return 10**values if packed["log"] else values
 
 
 # ---- comparing -------------------------------------------------------------------------------

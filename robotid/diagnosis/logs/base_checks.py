@@ -15,6 +15,7 @@ from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.diagnosis.catalogue import finding
+from robotid.diagnosis.decisions import DIFFERS
 from robotid.dynamics.completed_logs import closed_log, with_contacts
 from robotid.dynamics.constraint_rows import (
     constraint_jacobian,
@@ -48,7 +49,6 @@ _STRIDE = 0.2  # [s] over which the acceleration of a base is averaged against n
 _FASTEST = 30.0  # [m/s^2] RMS of this above which its position is in mm
 _IMU_MOVES = 0.1  # [rad/s] RMS from which angular velocities are compared
 _TILT = 8.0  # [deg] largest angle between the mean specific force and the vertical
-_SIZE = 0.1  # largest relative error of its size
 _SHORTEST = 2.0  # [s] in which the mean acceleration of a robot is small
 
 
@@ -478,10 +478,10 @@ def _check_gravity(log: Log, frame: ImuFrame, motion: Trajectory) -> Iterator[Fi
     size = float(np.linalg.norm(mean))
     cosine = -float(mean @ frame.gravity) / max(g * size, 1e-12)
     angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    if angle < _TILT and abs(size / g - 1.0) < _SIZE:
+    if angle < _TILT and abs(size / g - 1.0) < DIFFERS:
         return
     causes = {
-        "units": abs(size - 1.0) < _SIZE,
+        "units": abs(size - 1.0) < DIFFERS,
         "subtracted": size < 0.5 * g,
         "reversed": angle > 180.0 - _TILT,
         "scale": angle < _TILT,

@@ -18,7 +18,7 @@ from robotid.data.measured_velocity import (
 )
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import BEYOND_NOISE, SHARE_OF_ROWS
+from robotid.diagnosis.decisions import AGREES, BEYOND_NOISE, DIFFERS, SHARE_OF_ROWS
 from robotid.robot.parameters import ParameterLayout
 
 #: [rad/s, or m/s of a prismatic joint] slower: at rest.
@@ -40,20 +40,20 @@ _HARM = 0.02  # share of a channel's energy in its spikes that ruins a least-squ
 _NOISY = 0.3  # noise over signal from which a torque is uninformative
 _LAG = 0.002  # [s] a shorter lag is not reported
 _ALIKE = 0.8  # least correlation of a velocity with the derivative of its position
-_SCALE = 1.1  # velocity over d(q)/dt, or the inverse, from which the unit differs
 _ENCODER = 0.01  # largest difference of a step from 2 pi / 2^bits [bits]
 _BITS = range(9, 24)  # of encoders
 _DEAD = 1e-3  # velocity over d(q)/dt below which the channel is constant
-_EVEN = 0.05  # spread of the time steps over their median, or of mean over median, if uneven
 _GAP = 2.5  # [median steps] a longer step is a gap
 _LONG = 0.05  # [s] ... a longer gap is a warning
 _BUNCHED = 0.2  # [median steps] a shorter step is of rows that were stamped together ...
 _CLOCK_ALIKE = 0.3  # ... if the motion per row in them is less than this share of the usual one
-_SET = 1.0  # [s] in a longer gap, a position that moves as in one step shows that the clock was set
+_PAUSE = (
+    1.0  # [s] a longer rest at an end is reported; in a longer gap, a position that moves as in
+)
+# one step shows that the clock was set
 _STALE = 0.05  # share of stale rows from which they are a warning
 _CONTINUES = 0.15  # motion after repeated rows, over that in as many rows before and after it,
 _AROUND = 10  # ... estimated from at most this many rows
-_REST = 1.0  # [s] a longer rest at an end is reported
 _HARDLY = {"rad": 0.2, "m": 0.05}  # smaller range: the joint hardly moves
 _PLATEAU = 5  # consecutive rows at the limit of a clipped channel, at least
 _CLIPPED = 0.01  # share of the rows at the limit from which a channel is clipped
@@ -199,7 +199,7 @@ def _velocity_scale(
         moves = np.ptp(log.q[:, j]) > _LEAST["q"] and np.sqrt(a / len(v)) > _LEAST["dq"]
         is_dead = bool(moves and b < _DEAD**2 * a)
         is_alike = bool(moves and not is_dead and alike[j] > _ALIKE)
-        if is_dead or (is_alike and (ab / a > _SCALE or b / ab < 1 / _SCALE)):
+        if is_dead or (is_alike and (ab / a > 1 + DIFFERS or b / ab < 1 / (1 + DIFFERS))):
             yield finding(
                 "velocity_scale", log.name, joint, severity=severity.get(velocity, "error"),
                 what=is_dead, factor=0.0 if is_dead else float(np.sqrt(b / a)),
@@ -269,7 +269,7 @@ def check_rest(log: Log, motion: Trajectory, layout: ParameterLayout) -> Iterato
     before = after = 0.0
     if len(moving):
         before, after = float(moving[0] - log.t[0]), float(log.t[-1] - moving[-1])
-    if max(before, after) >= _REST:
+    if max(before, after) >= _PAUSE:
         yield finding(
             "standstill", log.name, before=before, after=after, start=seconds(moving[0]),
             end=seconds(moving[-1]),
@@ -295,7 +295,7 @@ def _rate(log: Log, step: Array, median: float) -> Iterator[Finding]:
     yield finding("rate", log.name, rate=rate, samples=len(log.t), duration=duration)
     regular = step[step < _GAP * median]
     spread = float(np.std(regular)) / median
-    if spread > _EVEN:
+    if spread > AGREES:
         yield finding(
             "jitter", log.name, relative_spread=spread, shortest=float(step.min()),
             longest=float(regular.max()), median=median,
@@ -304,7 +304,7 @@ def _rate(log: Log, step: Array, median: float) -> Iterator[Finding]:
 
 def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
     gaps = np.flatnonzero(step > _GAP * median * (1 + 1e-6))
-    is_set = np.array([step[k] > _SET and _goes_on(log.q, k) for k in gaps.tolist()], dtype=bool)
+    is_set = np.array([step[k] > _PAUSE and _goes_on(log.q, k) for k in gaps.tolist()], dtype=bool)
     if is_set.any():
         k = int(gaps[is_set][0])
         jump, at = float(step[k]) - median, float(log.t[k])
@@ -323,7 +323,7 @@ def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
 
 def _bunches(log: Log, step: Array) -> Iterator[Finding]:
     """Yield rows whose stamps are those of their arrival: they come together after a pause."""
-    mean = float(np.mean(step[step < _SET])) if (step < _SET).any() else 0.0
+    mean = float(np.mean(step[step < _PAUSE])) if (step < _PAUSE).any() else 0.0
     is_bunched = step < _BUNCHED * mean
     share = float(np.mean(is_bunched))
     moved = np.abs(np.diff(log.q, axis=0)).mean(axis=0)
@@ -334,7 +334,7 @@ def _bunches(log: Log, step: Array) -> Iterator[Finding]:
     yield finding(
         "bunched_stamps", log.name, rows=float(is_bunched.sum()), share=share, of=len(log.t),
         longest=float(step.max()), within=_BUNCHED * mean, mean=mean, usual=usual,
-        cure=abs(mean / usual - 1.0) < _EVEN,
+        cure=abs(mean / usual - 1.0) < AGREES,
     )  # fmt: skip
 
 

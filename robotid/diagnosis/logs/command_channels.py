@@ -12,7 +12,7 @@ from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.data.measured_velocity import quantum
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import CORRELATED, SHARE_OF_ROWS, SIGNIFICANT
+from robotid.diagnosis.decisions import CORRELATED, DIFFERS, SHARE_OF_ROWS, SIGNIFICANT, connected
 from robotid.diagnosis.logs.channels import runs_of
 from robotid.estimation.fitting.standard_errors import QUANTILE
 
@@ -39,7 +39,6 @@ _SETTLED = 0.5  # [s] after its last change a command is constant
 _CONSTANT = 2.0  # [s] least total time of constant command
 _DISTURBED = 0.01  # [rad or m] motion that is allowed under a constant command
 _EXPLAINED = 0.7  # share of this motion that the other joints must explain
-_TOP = 0.1  # relative distance from the largest speed within which a joint runs at it
 _FLAT = 0.6  # least share at the largest speed, of the rows above half of it; a sine has 0.43
 _UNLIKE = 0.2  # least relative difference between this speed and the speed of the command
 _PULSES = 3  # least number of movements that end at one speed
@@ -280,19 +279,12 @@ def _alike(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     lag = max(1, round(_INTERVAL / loops[0].step))
     changes = commands[lag:] - commands[:-lag]
     same = np.minimum(*(np.abs(np.corrcoef(x.T)) for x in (commands, changes)))
-    left = list(range(len(loops)))
-    while left:
-        group = [left.pop(0)]
-        for k in group:
-            near = [i for i in left if same[k, i] > CORRELATED]
-            group += near
-            left = [i for i in left if i not in near]
-        if len(group) > 1:
-            least = min(max(same[i, k] for k in group if k != i) for i in group)
-            names = [loops[i].name for i in sorted(group)]
-            yield finding(
-                "proportional_commands", log.name, names, correlation=least, joints=len(names)
-            )
+    for group in connected(same > CORRELATED):
+        least = min(max(same[i, k] for k in group if k != i) for i in group)
+        names = [loops[i].name for i in group]
+        yield finding(
+            "proportional_commands", log.name, names, correlation=least, joints=len(names)
+        )
 
 
 def _slow(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
@@ -342,7 +334,7 @@ def _saturated(log: Log, loops: Sequence[_Loop]) -> Iterator[tuple[str, Finding]
             continue
         clipped = []
         for start, stop in runs_of(np.abs(v) > 0.5 * top):
-            at = np.flatnonzero(np.abs(v[start:stop]) > (1 - _TOP) * top) + start
+            at = np.flatnonzero(np.abs(v[start:stop]) > (1 - DIFFERS) * top) + start
             flat = len(at) / (stop - start)
             if len(at) < 5 or flat < _FLAT:
                 continue

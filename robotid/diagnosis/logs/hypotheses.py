@@ -18,19 +18,20 @@ from robotid.diagnosis.decisions import TINY
 from robotid.diagnosis.logs.channels import AT_REST, ZERO
 from robotid.dynamics.drive_columns import drive_values, friction_directions, friction_speeds
 from robotid.dynamics.torque import carried_columns
-from robotid.robot.model import RobotModel
+from robotid.robot.model import GRAVITY, RobotModel
 
 #: Decrease of the misfit from which another gravity is reported.
 HINT = 0.7
+#: Ratio of unexplained shares from which another reading is certain; as decrease of the misfit.
+MUCH_BETTER = 12.0
+CERTAIN = float(np.log(MUCH_BETTER))
 #: An unexplained share below this is negligible.
 FLOOR = 1e-3
 _MARGIN = 0.15  # [s] rows closer to the end of a segment are not used: the filter has not settled
 _SLOW = 0.05  # largest speed of the unknown sign of friction of a slow joint, over its largest
 _POOR = 0.08  # unexplained share from which other readings of the positions are tested
-_CLEARLY = 2.0  # decrease of the misfit, a factor 7, beyond the readings with stated positions
 _ROWS, _QUARTER = 200, 4  # rows of these tests, and the divisor of their number in a first pass
 _OFFSETS = (0.4, -0.4, np.pi / 2, -np.pi / 2, np.pi)  # [rad] errors of a zero position
-_EARTH = 9.81  # [m/s^2]
 _ITERATIONS = 8  # of signs and fit
 _FOLDED = 0.4  # largest ratio of unexplained shares at which a torque is an absolute value
 
@@ -250,7 +251,7 @@ def _gravity(probe: Probe, stated: Explanation) -> Explanation:
     """
     from scipy.optimize import minimize
 
-    size = float(np.linalg.norm(probe.gravity)) or _EARTH
+    size = float(np.linalg.norm(probe.gravity) or np.linalg.norm(GRAVITY))
     joints = tuple(range(len(probe.model.joints)))
     is_stated = replace(stated, kind="gravity", joints=joints, values=tuple(probe.gravity.tolist()))
     is_poor = stated.share.max() > _POOR
@@ -317,7 +318,7 @@ def _positions(probe: Probe, best: float) -> Iterator[Explanation]:
         Probe.of(probe.model, probe.motion, probe.rows[::k]) for k in (every, _QUARTER * every)
     )
     joints = range(len(probe.model.joints))
-    enough, likely = best - _CLEARLY, best - 0.5 * _CLEARLY
+    enough, likely = best - CERTAIN, best - 0.5 * CERTAIN
     readings: list[Callable[[Probe], list[Explanation]]] = [
         *(partial(_exchanged, pair=pair) for pair in combinations(joints, 2)),
         *(partial(_reversed, j=j) for j in joints),
@@ -328,7 +329,7 @@ def _positions(probe: Probe, best: float) -> Iterator[Explanation]:
     offsets = [_offset(few, j, offset) for j in _revolute(few) for offset in _OFFSETS]
     first = min(offsets, key=lambda e: e.misfit, default=None)
     if first is not None and _refined(few, first).misfit < likely:
-        near = [e for e in offsets if e.misfit < first.misfit + 0.5 * _CLEARLY]
+        near = [e for e in offsets if e.misfit < first.misfit + 0.5 * CERTAIN]
         tried = [_offset(some, e.joints[0], e.values[0]) for e in near]
         refined = _refined(some, min(tried, key=lambda e: e.misfit))
         yield from [refined] if refined.misfit < enough else []

@@ -12,11 +12,13 @@ from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import BEYOND_NOISE, ROWS, SIGNIFICANT, TINY
+from robotid.diagnosis.decisions import BEYOND_NOISE, NO_ERROR_OF_MASSES, ROWS, SIGNIFICANT, TINY
 from robotid.diagnosis.logs.channels import STATIC
 from robotid.diagnosis.logs.hypotheses import (
+    CERTAIN,
     FLOOR,
     HINT,
+    MUCH_BETTER,
     Explanation,
     Probe,
     compensated,
@@ -31,10 +33,9 @@ from robotid.estimation.estimators.two_runs import payload_runs
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import payload_spread, prior_spread
 
-_MUCH_BETTER = 12.0  # ratio of unexplained shares from which another reading is certain ...
-_CERTAIN = float(np.log(_MUCH_BETTER))  # ... as a decrease of the misfit
 _UNEXPLAINED = 0.25  # unexplained share of a torque's variance that is reported, not accepted
-_WRONG = 0.5  # largest unexplained share of a torque with the right sign
+_WRONG = 0.5  # largest unexplained share of a torque with the right sign, or over that without
+# gravity, if the torque contains gravity
 _TILT = 5.0  # [deg] angle of gravity from the stated one that is a warning
 _WRONG_TILT = 30.0  # [deg] ... and an error
 _SPREAD = 0.3  # prior standard deviation of a link's mass, relative to the URDF's
@@ -43,12 +44,10 @@ _INDEPENDENT = 20.0  # number of independent instants of a log
 _PER_SECOND = 3.0  # ... per second of a short one
 _MASS, _MOMENT = 20.0, 10.0  # [kg], [kg m] prior standard deviations of a payload
 _WORSE = 0.25  # allowed increase of a torque's misfit over its own fit, in variances
-_OTHER_SCALE = 3.0  # a torque scale farther from 1 is no error of masses
-_OTHER_UNIT = 30.0  # ... and a common scale of all torques farther from 1 is another unit, no gain
+_OTHER_UNIT = 30.0  # a common scale of all torques farther from 1 is another unit, no gain
 _SCALES = np.logspace(-3, 3, 61)
 _ALIKE = _SCALES[2] / _SCALES[0]  # ratio below which two factors on this grid are equal
 _LARGE = 0.08  # payload over the arm's mass that errors of the links do not explain
-_FOLLOWED = 0.5  # ratio of unexplained shares with and without gravity, if a torque contains it
 _MISMATCH = 7.5  # largest sum of squared errors of the links, in standard deviations
 _NOTHING = 0.01  # of the arm's mass, the smallest change of load
 _CLEARLY = 1.5  # least ratio of the misfit of other torque scales to that of a load
@@ -72,7 +71,7 @@ class _Reading:
     @property
     def is_certain(self) -> bool:
         is_explained = float(np.median(self.best.share)) < _UNEXPLAINED
-        return is_explained and self.gain > _CERTAIN
+        return is_explained and self.gain > CERTAIN
 
     @property
     def joints(self) -> list[str]:
@@ -171,11 +170,11 @@ _FINDINGS: dict[str, Callable[[_Reading], Iterator[Finding]]] = {
 def _is_excused(best: Explanation, loaded: Explanation) -> bool:
     if best.kind in ("torque_sign", "unsigned_torque"):
         excused = (
-            loaded.share[j] < min(_UNEXPLAINED, _MUCH_BETTER * (best.share[j] + FLOOR))
+            loaded.share[j] < min(_UNEXPLAINED, MUCH_BETTER * (best.share[j] + FLOOR))
             for j in best.joints
         )
         return all(excused)
-    return loaded.misfit - best.misfit < _CERTAIN
+    return loaded.misfit - best.misfit < CERTAIN
 
 
 def _unexplained(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
@@ -272,7 +271,7 @@ def _check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
     _, theta, error = model.fit(ones)
     if not model.is_this_robot(ones):
         scale = _torque_scales(model)
-        other = np.flatnonzero(np.abs(np.log(scale)) > np.log(_OTHER_SCALE))
+        other = np.flatnonzero(np.abs(np.log(scale)) > np.log(NO_ERROR_OF_MASSES))
         if len(other) and model.is_this_robot(scale):
             yield from _scaled(probe, scale, _needed(model, scale, other), name)
             return
@@ -305,7 +304,7 @@ def _holds_no_gravity(probe: Probe) -> bool:
 def _holds_gravity(probe: Probe) -> bool:
     """Return whether the torque of a joint contains its gravity torque by the URDF."""
     with_gravity, without = own_share(probe), own_share(probe, np.zeros(3))
-    followed = (with_gravity + FLOOR < _FOLLOWED * (without + FLOOR)) & (without < 1.0)
+    followed = (with_gravity + FLOOR < _WRONG * (without + FLOOR)) & (without < 1.0)
     return bool(followed.any())
 
 
@@ -320,7 +319,7 @@ def _torque_scales(model: LoadModel) -> Array:
     chi = model.misfits(np.vstack([np.ones(n), common]))
     best = int(np.argmin(chi[1:]))
     starts = [np.ones(n)]
-    is_other = abs(np.log(_SCALES[best])) > np.log(_OTHER_SCALE)
+    is_other = abs(np.log(_SCALES[best])) > np.log(NO_ERROR_OF_MASSES)
     if is_other and chi[0] - chi[1 + best] > SIGNIFICANT**2:
         starts.append(common[best])
     ends = np.array([_descended(model, start) for start in starts])

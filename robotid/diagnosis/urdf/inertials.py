@@ -10,7 +10,7 @@ import numpy as np
 from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import ROUNDING
+from robotid.diagnosis.decisions import AGREES, ROUNDING
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.robot.bodies import link_places
 from robotid.robot.geometry import body_points, kinematic_lengths
@@ -26,13 +26,14 @@ _OF_MASSES = (
 )  # fmt: skip
 _DENSEST, _LIGHTEST = 20_000.0, 10.0  # [kg/m^3] over the box: about solid tungsten, and foam
 _MARGIN = 0.1  # of the box's diagonal, by which a centre of mass may lie outside
-_LONGEST = 5.0**0.5  # ellipsoid of a body with half of its mass on each of two sides, over the box
+_LONGEST = np.sqrt(
+    5.0
+)  # ellipsoid of a body with half of its mass on each of two sides, over the box
 _SLENDER = 1.6  # ellipsoid over the length that the kinematics give; a uniform rod has 1.29
 _THIN = 0.01  # [m] least side of a box, so that thin sheets have a volume
 _SMALL = 1e-3  # share of the robot's mass below which a fault of a body is only a note
 _ROUND = tuple(10.0**k for k in range(-6, 3))  # inertias [kg m^2] and masses [kg] of templates
 _ALIKE = 1e-9  # relative difference of copied inertials, and of a sum of moments, by rounding
-_SIZE = 0.05  # largest relative difference of boxes of equal size
 
 
 def negative_masses(robot: ET.Element) -> Iterator[Finding]:
@@ -313,7 +314,7 @@ def _copies(model: RobotModel, points: dict[str, Array]) -> Iterator[Finding]:
         if len(group) < 2 or not boxes.any() or values[group[0]][0] <= 0:
             continue
         spread = float(np.max(np.abs(boxes - boxes[0])) / np.max(boxes))
-        if spread >= _SIZE:
+        if spread >= AGREES:
             yield finding(
                 "copied_inertial", subject=f"link {group[0]}", links=len(group), difference=spread,
                 names=listed(group),

@@ -11,12 +11,12 @@ from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import SHARE_OF_ROWS, TENFOLD, TINY
+from robotid.diagnosis.decisions import DIFFERS, NO_ERROR_OF_MASSES, SHARE_OF_ROWS, TENFOLD, TINY
 from robotid.diagnosis.residual.misfit import Misfit, misfit_finding
 from robotid.diagnosis.urdf.inertials import audit_bodies
 from robotid.diagnosis.verdict.parameter_table import correlated_parameters
-from robotid.diagnosis.verdict.scale_check import DIFFERS, friction_shares
-from robotid.diagnosis.verdict.verdict import BEATEN, GOOD, SMALL, error_of, is_harmless_cost
+from robotid.diagnosis.verdict.scale_check import friction_shares
+from robotid.diagnosis.verdict.verdict import BEATEN, GOOD, NAMED, SMALL, error_of, is_harmless_cost
 from robotid.estimation.estimators.consistent_fit import slabs
 from robotid.estimation.fitting.estimator_settings import BoundedSettings, ConsistentSettings
 from robotid.estimation.fitting.fitted import Fit
@@ -27,8 +27,6 @@ from robotid.robot.geometry import body_boxes, body_points
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
-_FAR = 3.0  # a total mass differs from the URDF's at most by this factor
-_NAMED = 5  # outliers that a finding names
 _BIASED = 0.5, 2.0  # shift of a parameter by encoder noise, in standard errors: note, warning
 _COARSE = 0.1  # share of encoder noise over the largest one, from which a joint is named
 _DIFFERS = 1.2  # residual of a consistent fit over that of WLS above which it is reported
@@ -61,7 +59,7 @@ def fit_findings(
     at_bound = [x for x, is_at in zip(fit.model.layout.names, fit.at_bound, strict=True) if is_at]
     if at_bound:
         joints = list(dict.fromkeys(name.rpartition(".")[0] for name in at_bound))
-        names = listed(at_bound, _NAMED)
+        names = listed(at_bound, NAMED)
         yield finding("at_bound", "", joints, subject=", ".join(at_bound), names=names)
     for body in fit.estimate.details.get("relaxed", ()):
         yield finding("extent_contradicted", subject=f"link {body}", link=body)
@@ -249,8 +247,12 @@ def _total_mass(fit: Fit) -> Iterator[Finding]:
     pi = np.array([fit.prior, fit.standard])
     before, after = pi[:, :size:10].sum(axis=1).tolist()
     is_stated = fit.estimator.bounds.total is not None
-    if not is_stated and before > 0 and not before / _FAR <= after <= _FAR * before:
-        evidence = {"urdf": before, "identified": after, "far": _FAR}
+    if (
+        not is_stated
+        and before > 0
+        and not before / NO_ERROR_OF_MASSES <= after <= NO_ERROR_OF_MASSES * before
+    ):
+        evidence = {"urdf": before, "identified": after, "far": NO_ERROR_OF_MASSES}
         yield finding("total_mass", subject="standard_parameters", **evidence)
 
 
@@ -371,9 +373,9 @@ def _of_outliers(fit: Fit) -> Finding:
     places = "; ".join(
         f"{o.joint} at {o.t:.3f} s of {o.log}: measured {o.torque:.4g}, predicted "
         f"{o.predicted:.4g}, residual {o.size:.0f} times the typical one"
-        for o in outliers[:_NAMED]
+        for o in outliers[:NAMED]
     )
-    places += f"; and {len(outliers) - _NAMED} more" if len(outliers) > _NAMED else ""
+    places += f"; and {len(outliers) - NAMED} more" if len(outliers) > NAMED else ""
     count = f"{len(outliers)} outlier{'s' if len(outliers) > 1 else ''}"
     return finding(
         "outliers", "", outliers[0].joint, count=count, where=places,

@@ -9,7 +9,7 @@ import numpy as np
 
 from robotid.base.files import finite
 from robotid.base.typing import Array
-from robotid.diagnosis.decisions import CORRELATED
+from robotid.diagnosis.decisions import CORRELATED, connected
 from robotid.estimation.fitting.fitted import Fit, Identified
 
 #: Columns of a row: link or drive, parameter, the URDF's value, the identified one, its standard
@@ -19,7 +19,8 @@ _NUMBERS = HEADERS[2:7]
 #: Mass [kg], centre of mass [m], inertia about it [kg m^2], in the axes of the joint frame.
 CENTRAL_TERMS = ("m", "cx", "cy", "cz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
 _PAIRS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))  # axes of Pinocchio's six inertias
-_ORDER = [0, 1, 2, 3, 4, 6, 9, 5, 7, 8]  # of CENTRAL_TERMS in Pinocchio's order
+_PINOCCHIO = ("m", "cx", "cy", "cz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
+_ORDER = [_PINOCCHIO.index(term) for term in CENTRAL_TERMS]
 
 
 def parameter_entries(found: Identified) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
@@ -74,11 +75,8 @@ def _correlations(C: Array, own: Sequence[int]) -> Array:
 
 def correlated_sets(C: Array, own: Sequence[int]) -> list[list[int]]:
     """Return the sets of parameters that strong correlations connect: C (p, p)."""
-    sets: list[set[int]] = []
-    for pair in np.argwhere(np.triu(np.abs(_correlations(C, own)) > CORRELATED, 1)).tolist():
-        joined = [s for s in sets if s.intersection(pair)]
-        sets = [s for s in sets if s not in joined] + [set(pair).union(*joined)]
-    return [[own[k] for k in sorted(s)] for s in sets]
+    groups = connected(np.abs(_correlations(C, own)) > CORRELATED)
+    return [[own[k] for k in group] for group in groups]
 
 
 def correlated_parameters(found: Identified) -> dict[int, tuple[int, float]]:

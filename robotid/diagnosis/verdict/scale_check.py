@@ -13,7 +13,7 @@ import scipy.special
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import sentence_of
-from robotid.diagnosis.decisions import TINY
+from robotid.diagnosis.decisions import AGREES, DIFFERS, TINY
 from robotid.dynamics.constraint_rows import loop_basis, without_forces
 from robotid.dynamics.prediction import predict
 from robotid.dynamics.torque import joint_torque_regressor
@@ -29,10 +29,6 @@ _ANOTHER = 0.35  # difference of gravity and total mass from which on they contr
 _CLEARLY = 4.0  # distance of a common factor from 1 over the share of gravity that it leaves, ...
 _BETTER = 0.5  # ... and the largest ratio of that share to the one that a payload leaves
 _TOTAL = "total mass"
-#: Relative difference up to which a mass or a gravity torque confirms the torque scale [-].
-AGREES = 0.05
-#: Difference of a factor from 1 that is reported, and standard error of a ratio that is used [-].
-DIFFERS = 2 * AGREES
 _ABSORBS = 0.1  # share of a change of a stated mass that a link takes up to be named
 
 

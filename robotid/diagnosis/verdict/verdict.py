@@ -48,8 +48,8 @@ SMALL = 5.0
 _HARMLESS = 1.0  # [%] of the torque, below which an error gives no warning
 _MUCH = 2.0  # ratio of two errors, or of two gravity torques, that is no chance
 _BASE = "base."  # of the rows of a floating base
-_NAMED = 8  # parameters that a reason names
-_USES_NAMED = 3  # joints that the line names
+#: Parameters, joints or places that a sentence names.
+NAMED = 8
 _NOT_VERIFIED = "not verified, no validation log"
 _UNSCALED = "torque scale not verified"
 _HYPOTHESES = ("current_for_torque", "gravity", "gravity_compensated", "unexplained_torque",
@@ -193,7 +193,7 @@ class Determined:
 
     @staticmethod
     def _sentence(what: str, names: Sequence[str]) -> str:
-        named = listed(names, _NAMED)
+        named = listed(names, NAMED)
         return sentence_of("verdict:determined", what=what, count=len(names), names=named)
 
 
@@ -327,7 +327,7 @@ def _predicted(joints: Mapping[str, str]) -> str:
 
 def _named(joints: Mapping[str, str], status: str) -> str:
     """Return the joints with a status, as part of a sentence."""
-    return listed([joint for joint, found in joints.items() if found == status], _USES_NAMED)
+    return listed([joint for joint, found in joints.items() if found == status], NAMED)
 
 
 def _with(use: str, condition: str) -> str:
