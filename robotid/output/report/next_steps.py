@@ -137,7 +137,7 @@ def exports_of(robot: str, origin: Origin, *, has_gains: bool = False) -> list[S
 def sentence_of(message: str) -> str:
     """Return a message as a sentence; the name of a file at its start stays as it is."""
     first = message.partition(" ")[0].rstrip(":,")
-    return f"{message}." if "." in first else f"{message[0].upper()}{message[1:]}."
+    return message if "." in first else f"{message[0].upper()}{message[1:]}"
 
 
 def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
@@ -181,7 +181,7 @@ def _steps_of_motion(found: Identification, origin: Origin) -> tuple[Step, ...]:
     causes = grouped([f for f in found.findings if f.severity == "warning"], found.model.joints)
     urgent = sorted(causes, key=lambda cause: not set(poor).intersection(cause.joints))
     last = _step("wrong_position", origin, (*replay, *again), joints=listed(poor, NAMED))
-    return (*(Step(sentence_of(cause.messages[0])) for cause in urgent[: MOST - 1]), last)
+    return (*(Step(f"{sentence_of(cause.messages[0])}.") for cause in urgent[: MOST - 1]), last)
 
 
 def _once(steps: Sequence[Step]) -> tuple[Step, ...]:
@@ -336,7 +336,7 @@ def _zeros(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause])
 
 def _as_found(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     """Return the messages of the findings, which name a cause and its remedy."""
-    return Step(" ".join(sentence_of(m) for cause in causes for m in cause.messages[:1]))
+    return Step(" ".join(f"{sentence_of(m)}." for cause in causes for m in cause.messages[:1]))
 
 
 def _watch(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
@@ -373,7 +373,7 @@ def _inspection(found: TorqueIdentification) -> tuple[str, ...]:
 
 
 def _doctor(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    return Step(sentence_of(causes[0].messages[0]), origin.from_source("doctor"))
+    return Step(f"{sentence_of(causes[0].messages[0])}.", origin.from_source("doctor"))
 
 
 def _uses(found: TorqueIdentification, origin: Origin, asked: Sequence[Step]) -> list[Step]:
