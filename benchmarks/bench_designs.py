@@ -21,7 +21,7 @@ from robotid.design.design import Multipliers
 from robotid.design.information import criterion
 from robotid.design.limits import LIMITS
 from robotid.data.log import Trajectory
-from robotid.dynamics.compiled import row_lanes
+from robotid.dynamics.compiled import tree_lanes
 
 FINE = 30  # ten times 3 times the grid of the first rounds
 
@@ -80,7 +80,7 @@ def main():
     options = parser.parse_args()
     cases, count, seeds = (CASES[1:], 20, 1) if options.quick else (CASES, 500, 5)
     initialised = time.process_time()
-    row_lanes()
+    tree_lanes()
     start = time.process_time() - initialised
     tasks = {name: designer(name) for name in cases}
     print(

@@ -31,7 +31,7 @@ from random_servos import bandwidth, faulty_logs, good_commands, some_servos
 
 from robotid.cli.job import Job, LogEntry, read_job
 from robotid.cli.logs import examine
-from robotid.data.files.formats import write_columns
+from robotid.data.files.read import write_columns
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.diagnosis.logs.command_channels import check_commands

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from setting import machine
 
-from robotid.data.files.formats import write_columns
+from robotid.data.files.read import write_columns
 from robotid.dynamics.prediction import predict_instants
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.truth import another_robot

@@ -31,7 +31,7 @@ from helpers.hostile_inputs import KINDS as INPUT_KINDS
 from hypothesis import HealthCheck, Phase, given, seed, settings
 
 KINDS = INPUT_KINDS | COMMAND_KINDS | ARGUMENT_KINDS
-SLOW = ("values, identified", "result.json", "report of result.json", "loop of a job")
+SLOW = ("values, identified", "result.json", "loop of a job")
 LONGEST = 60  # [s] for one input
 MEMORY = 8 * 2**30  # [bytes] of a process
 COUNTS = ["inputs", "tracebacks", "aborts", "half-written", "hangs"]

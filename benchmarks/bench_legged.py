@@ -48,7 +48,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.base_checks import check_base
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import compress
-from robotid.dynamics.used_rows import base_problem
+from robotid.dynamics.prepared_logs import base_problem
 from robotid.estimation.fitting.estimator_settings import ConsistentSettings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.pipeline import identify

@@ -110,12 +110,8 @@ def left_out(name, entries, count):
     model = job.model()
     (logs,) = survey_logs(job, model, entries)
     inside = alike = total = joint = 0
-    errors, rows, moved = [], [], []
-    rng, names = np.random.default_rng(0), [str(k) for k in range(len(logs))]
-    together = Recordings(model, structural_mapping(model), logs)
+    errors, rows, rng = [], [], np.random.default_rng(0)
     wanted = wanted_families(job.friction, model.joints)
-    whole = with_drives(together, job.estimator, wanted)
-    whole = replace(whole, variation=vary(names, whole.runs))
     for k in range(count):
         others = [log for j, log in enumerate(logs) if j != k]
         some = Recordings(model, structural_mapping(model), others, [logs[k]])
@@ -130,17 +126,12 @@ def left_out(name, entries, count):
         unit = np.zeros(len(logs), int)
         sums = sums_of(fit.model, every.mapping, segments, fit.standard, fit.wls.sigma)
         found = runs_of(fit.model, every.mapping, fit.standard, sums, unit)
-        moved += changes(replace(fit, variation=vary(names, found)), whole)
         drives = [group for group in found if group.group.kind == "drive"]
         for group in drives:
             inside, alike, total = np.add((inside, alike, total), compared(group.runs, k))
         joint += fit.variation is not None and is_likely(drives, k, rng)
     print(f"| {name} | {len(logs)} | {100 * inside / total:.1f} % | {100 * alike / total:.1f} % "
           f"| {total} | {joint} of {count} |", flush=True)  # fmt: skip
-    middle, most = np.quantile(moved, [0.5, 0.9])
-    print(f"  log added to the fit of the others, beside a fit to all: the means of {len(moved)} "
-          f"terms differ by {middle:.2f} standard errors (median; 90 % below {most:.2f}, all below "
-          f"{max(moved):.2f})", flush=True)  # fmt: skip
     if fit.between is None:
         return
     errors, rows = np.array(errors), np.nanmean(rows, axis=(0, 2))
@@ -148,19 +139,6 @@ def left_out(name, entries, count):
     print(f"  torque of the log left out, measured RMSE over expected, geometric mean: with spread "
           f"{ratio[0]:.2f}, without {ratio[1]:.2f}; rows within 95 %: {100 * rows[0]:.1f} %, "
           f"{100 * rows[1]:.1f} %", flush=True)  # fmt: skip
-
-
-def changes(fit, whole):
-    """Return differences of the means of drive terms in two fits, over their standard errors.
-
-    Of drives with the same terms in both.
-    """
-    terms = [one.model.layout.own for one in (fit, whole)]
-    same = {drive.name for drive in whole.model.layout.drives
-            if len({each.get(drive.name, ()) for each in terms}) == 1}  # fmt: skip
-    own = {each.name: each.prediction for each in fit.variation.parameters}
-    return [abs(own[x.name].mean - x.prediction.mean) / x.prediction.std_error
-            for x in whole.variation.parameters if x.name.rpartition(".")[0] in same]  # fmt: skip
 
 
 def torque_errors(fit):

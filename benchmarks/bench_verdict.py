@@ -31,7 +31,7 @@ from verdict_cases import CASES, GOOD, ROBOTS, make
 from robotid import identify
 from robotid.cli.job import Job, LogEntry
 from robotid.base.exceptions import RobotIdError
-from robotid.data.files.formats import write_columns
+from robotid.data.files.read import write_columns
 
 QUICK = (("ur5", "tiago"), ("clean, far from the URDF", "torque 20 ms late",
          "two torque columns swapped", "degrees", "all torques x 0.8"))  # fmt: skip

@@ -130,7 +130,6 @@ def stages(data):
         second[f"small-{fault}"] = ["identify", urdf, f"{fault}.csv", "--out", "OUT"]
     third = {
         "compare": ["compare", "small-consistent", "small-wls", "--out", "OUT/page.html", "--json"],
-        "report": ["report", result, "--out", "OUT/report.html"],
         "replay": ["replay", urdf, log, result, "--html", "OUT/page.html"],
         "preview-given": ["preview", urdf, "motion.csv", "--given", result, "--json"],
         "payload-small": ["payload", urdf, "scale.csv", "--reference", result, "--json"],

@@ -8,8 +8,13 @@ from dataclasses import MISSING
 from pathlib import Path
 
 from robotid.cli.job import Job, LogEntry, PayloadEntry
-from robotid.data.signal_settings import BaseSource, LogSource, LogUnits, SignalSettings
-from robotid.data.transmission import Transmission
+from robotid.data.signal_settings import (
+    BaseSource,
+    LogSource,
+    LogUnits,
+    SignalSettings,
+    Transmission,
+)
 from robotid.dynamics.simulation.simulation_settings import Simulation
 from robotid.estimation.fitting.estimator_settings import ESTIMATORS, ConstraintSettings
 from robotid.identification.closed_loop.loop_settings import LoopSettings

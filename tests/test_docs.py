@@ -17,7 +17,7 @@ from helpers.paths import DOCS, ROOT
 
 from robotid.cli import COMMANDS, main
 from robotid.cli.job import Job, LogEntry, job_from_settings
-from robotid.data.files.formats import write_columns
+from robotid.data.files.read import write_columns
 from robotid.diagnosis.catalogue import entries
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings

@@ -19,7 +19,6 @@ EXAMPLES = {
     "excite": 6,
     "loop of a job": 3,
     "result.json": 15,
-    "report of result.json": 5,
     "Python arguments": 40,
 }  # others: 8
 

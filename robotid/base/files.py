@@ -66,7 +66,8 @@ def check_file(target: Path, inputs: Iterable[str | Path | None] = ()) -> None:
     if _is_stream(target):
         return
     _require_writable(target.parent)
-    if not target.exists() or _is_hidden(target):
+    is_hidden = any(part.startswith(".robotid-") for part in target.parts[:-1])  # finished units
+    if not target.exists() or is_hidden:
         return
     named = [Path(path) for path in inputs if path]
     files = [*named, *(folder / name for folder in named for name in _RECORDS)]
@@ -107,11 +108,6 @@ def remove_written(files: Iterable[Path]) -> None:
 def _require_writable(folder: Path) -> None:
     if not os.access(folder, os.W_OK | os.X_OK):
         raise SettingsError(f"the folder {str(folder)!r} is not writable; name another folder")
-
-
-def _is_hidden(path: Path) -> bool:
-    """Return whether a file is in a hidden folder of robotid, as that of finished units."""
-    return any(part.startswith(".robotid-") for part in path.parts[:-1])
 
 
 def _is_written(path: Path) -> bool:
@@ -197,19 +193,14 @@ def folder_beside(target: Path) -> Iterator[Path]:
                     os.replace(target / name, old / name)
                 os.replace(new / name, target / name)
         except BaseException:
-            _put_back(names, new, old, target)
+            for name in names:
+                if os.path.lexists(old / name):
+                    os.replace(old / name, target / name)
+                elif not os.path.lexists(new / name):
+                    (target / name).unlink()
             raise
         for name in names:
             _marked(target / name)
-
-
-def _put_back(names: Iterable[str], new: Path, old: Path, target: Path) -> None:
-    """Undo an incomplete replacement of files."""
-    for name in names:
-        if os.path.lexists(old / name):
-            os.replace(old / name, target / name)
-        elif not os.path.lexists(new / name):
-            (target / name).unlink()
 
 
 def write_text(text: str, target: str | Path) -> Path:

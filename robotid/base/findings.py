@@ -128,14 +128,11 @@ def sentence(findings: Sequence[Finding]) -> str:
     for literal, name, spec, how in Formatter().parse(template):
         text.append(literal)
         if name is not None:
-            values = [_value(x, name) for x in ([last] if how == "w" else findings)]
+            chosen = [last] if how == "w" else findings
+            values = [x.words[name] if name in x.words else x.evidence[name] for x in chosen]
             text.append(_filled(values, spec or "", how or ""))
     logs = ", ".join(dict.fromkeys(finding.log for finding in findings))
     return f"{logs}: {''.join(text)}" if logs else "".join(text)
-
-
-def _value(finding: Finding, name: str) -> str | float:
-    return finding.words[name] if name in finding.words else finding.evidence[name]
 
 
 def _filled(values: Sequence[str | float], spec: str, how: str) -> str:

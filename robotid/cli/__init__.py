@@ -1,8 +1,13 @@
-"""The command line: one file a command, with its settings, its work and what it prints."""
+"""The command line: one file a command, with its settings, its work and what it prints.
+
+A command is a module with ``add_flags(parser)`` and ``run(options)``, which returns the exit code,
+or None for 0. One with many flags also has MAIN_FLAGS and EXAMPLES, for its short help.
+"""
 
 import argparse
 import atexit
 import ctypes
+import difflib
 import gc
 import io
 import os
@@ -11,6 +16,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
+from typing import Any, NoReturn
 
 from robotid.base.exceptions import RobotIdError, SettingsError
 from robotid.base.versions import __version__
@@ -22,7 +28,6 @@ from robotid.cli.console import (
     shown_log,
     terminations_raised,
 )
-from robotid.cli.parser import CommandParser
 
 __all__ = ["COMMANDS", "main"]
 
@@ -50,8 +55,7 @@ def _commands() -> dict[str, str]:
     return commands
 
 
-#: The help line of each command by name. A command is a module with add_flags and run; one with
-#: many flags also has MAIN_FLAGS and EXAMPLES, for its short help.
+#: The help line of each command by name.
 COMMANDS = _commands()
 
 
@@ -76,7 +80,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(words: Sequence[str]) -> int:
     """Run a command line, print its error if it fails, and return its exit code."""
-    _complete()
+    if "_ARGCOMPLETE" in os.environ:  # a shell asks for completions
+        import argcomplete
+
+        argcomplete.autocomplete(_parser(os.environ.get("COMP_LINE", "").split()[1:]))
     options = _parser(words).parse_args(words, argparse.Namespace(words=words))
     _keep_pages()
     try:
@@ -110,15 +117,6 @@ def _keep_pages() -> None:
         set_option(_TRIM_THRESHOLD, _SPARE)
 
 
-def _complete() -> None:
-    """Print the possible completions and exit, if a shell asks for them through argcomplete."""
-    if "_ARGCOMPLETE" in os.environ:
-        import argcomplete
-
-        line = os.environ.get("COMP_LINE", "")
-        argcomplete.autocomplete(_parser(line.split()[1:]))
-
-
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     """Return the parser of a command line; it has one command if the line starts with a command."""
     parser = CommandParser(
@@ -137,5 +135,97 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
             command.set_defaults(run=module.run)
             module.add_flags(command)
             if hasattr(module, "MAIN_FLAGS"):
-                command.shorten_help(module.MAIN_FLAGS, module.EXAMPLES)
+                command.add_argument("--help-all", action="help", help="show all flags and exit")
+                if "--help-all" not in words:
+                    command.main_flags, command.examples = module.MAIN_FLAGS, module.EXAMPLES
     return parser
+
+
+class CommandParser(argparse.ArgumentParser):
+    """A parser that suggests the nearest choice, and whose help may show its main flags only.
+
+    A flag with one value is refused if it occurs twice.
+    """
+
+    main_flags: Sequence[str] = ()  # of the short help; all flags if empty
+    examples: Sequence[str] = ()  # command lines at its end
+
+    def __init__(self, *words: Any, **settings: Any) -> None:  # noqa: ANN401
+        super().__init__(*words, **settings)
+        for name in (None, "store"):
+            self.register("action", name, _StoreOnce)
+
+    def parse_known_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """Parse words; refuse a flag that a command does not have, with the nearest flag."""
+        found, unknown = super().parse_known_args(args, namespace)
+        flags = [word.partition("=")[0] for word in unknown if word.startswith("--")]
+        if flags and self._subparsers is None:
+            known = [flag for action in self._actions for flag in action.option_strings]
+            near = difflib.get_close_matches(flags[0], known, n=1)
+            hint = f"; did you mean {near[0]}?" if near else f"; see '{self.prog} --help'"
+            self.error(f"{flags[0]} is unknown{hint}")
+        if unknown and self._subparsers is None:
+            self.error(
+                f"{unknown[0]!r} is one word too many; a flag takes one word, as JOINT=NUMBER or "
+                f"A,B; see '{self.prog} --help'"
+            )
+        return found, unknown
+
+    def error(self, message: str) -> NoReturn:
+        """Print the arguments and a message, and exit with code 2."""
+        self.exit(2, f"{self._usage()}{self.prog}: error: {message}\n")
+
+    def format_help(self) -> str:
+        """Return the help: the main flags and examples if there are any, else all flags."""
+        if not self.main_flags:
+            return super().format_help()
+        formatter = self._get_formatter()
+        arguments = [action for action in self._actions if not action.option_strings]
+        shown = ("--help-all", *self.main_flags)
+        flags = [a for a in self._actions if {*shown} & {*a.option_strings}]
+        for title, actions in (("arguments", arguments), ("main flags", flags)):
+            formatter.start_section(title)
+            formatter.add_arguments(actions)
+            formatter.end_section()
+        examples = "\n".join(f"  {line}" for line in self.examples)
+        return f"{self._usage()}\n{formatter.format_help()}\nexamples:\n{examples}\n"
+
+    def _usage(self) -> str:
+        arguments = []
+        for action in self._actions:
+            if not action.option_strings:
+                name = str(action.metavar or action.dest)
+                arguments.append(f"[{name} ...]" if action.nargs == "*" else name)
+            elif action.required:
+                arguments.append(f"{action.option_strings[0]} {action.metavar}")
+        return f"usage: {self.prog} {' '.join(arguments)} [flags]\n"
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:  # noqa: ANN401
+        """Refuse a word that is not among the choices of an argument, with the nearest choice."""
+        if action.choices is None or value in action.choices:
+            return
+        known = [str(choice) for choice in action.choices]
+        near = difflib.get_close_matches(str(value), known, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else "."
+        wanted = ", ".join(known)
+        raise argparse.ArgumentError(action, f"{value!r} is unknown{hint} Known: {wanted}")
+
+
+class _StoreOnce(argparse._StoreAction):
+    """Store the value of a flag; refuse a second value."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,  # noqa: ANN401
+        option_string: str | None = None,
+    ) -> None:
+        stored = getattr(namespace, self.dest, None)
+        if self.option_strings and stored is not None and stored is not self.default:
+            raise argparse.ArgumentError(
+                self, f"stated twice, as {stored} and as {values}; state it once"
+            )
+        super().__call__(parser, namespace, values, option_string)

@@ -9,7 +9,7 @@ from typing import Any
 from robotid.base.findings import listed
 from robotid.base.text import columns, in_digits_of
 from robotid.cli.console import echo, show_found, window_name
-from robotid.cli.flags import add_json, add_verbose
+from robotid.cli.job import add_shown
 from robotid.identification.summary import cell
 from robotid.output.report.comparison import compare_results, write_comparison
 
@@ -34,24 +34,20 @@ def compare(results: Sequence[str | Path], page: str | Path | None = None) -> di
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add = parser.add_argument
     add("results", nargs="+", metavar="RESULT.json")
     add("--out", metavar="FILE.html", help="page to write")
-    add_json(parser)
-    add_verbose(parser, "print all base parameters")
+    add_shown(parser, "json", verbose="print all base parameters")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     content = compare(options.results, options.out)
     show_found(content, options, partial(_show, is_verbose=options.verbose))
     if options.out and not options.json:
         print(f"\nwritten to {options.out}")
 
 
-def _show(content: dict[str, Any], *, is_verbose: bool = False) -> None:
-
+def _show(content: dict[str, Any], *, is_verbose: bool) -> None:
     results = content["results"]
     labels = [result["label"] for result in results]
     for result in results:

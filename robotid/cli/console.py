@@ -1,7 +1,6 @@
 """What commands print: results, findings, errors, progress; and their end after a signal."""
 
 import argparse
-import errno
 import json
 import logging
 import os
@@ -13,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 from robotid.base.text import command_lines, period, terminal_width, tinted, wrapped
 
@@ -33,9 +32,7 @@ def echo(text: str, indent: str = "", tone: str = "") -> None:
 
 def print_files(folder: str, names: Sequence[str]) -> None:
     """Print the files that were written, one per line."""
-    print("\nwritten:")
-    for name in names:
-        print(f"  {Path(folder) / name}")
+    print("\nwritten:", *(f"  {Path(folder) / name}" for name in names), sep="\n")
 
 
 def print_steps(steps: "Sequence[Step]") -> None:
@@ -131,34 +128,20 @@ def open_closed_streams() -> None:
         pass
     os.close(number)
     for name in ("stdout", "stderr"):
-        if not _is_open(getattr(sys, name)):
+        if getattr(sys, name) is None:
             null = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 - open until the end
             setattr(sys, name, null)
-
-
-def _is_open(stream: TextIO | None) -> bool:
-    """Return whether a stream is writable; a stream without a number is."""
-    try:
-        number = -1 if stream is None else stream.fileno()
-    except (OSError, ValueError):  # it is in memory
-        return True
-    try:
-        os.write(number, b"")
-    except OSError as error:
-        return error.errno != errno.EBADF
-    return True
 
 
 @contextmanager
 def terminations_raised() -> Iterator[None]:
     """Raise ``Terminated`` at SIGTERM and SIGHUP in the context; later signals are ignored."""
-    numbers = [number for number in _ENDS if signal.getsignal(number) is signal.SIG_DFL]
-    if threading.current_thread() is not threading.main_thread():
-        numbers = []
+    is_main = threading.current_thread() is threading.main_thread()
+    numbers = [x for x in _ENDS if is_main and signal.getsignal(x) is signal.SIG_DFL]
 
     def end(number: int, _: FrameType | None) -> None:
-        for each in numbers:
-            signal.signal(each, signal.SIG_IGN)
+        for later in numbers:
+            signal.signal(later, signal.SIG_IGN)
         raise Terminated(number)
 
     for number in numbers:

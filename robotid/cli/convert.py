@@ -2,7 +2,6 @@
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +9,10 @@ from robotid.base.exceptions import DataError
 from robotid.base.files import check_file
 from robotid.base.findings import listed
 from robotid.cli.console import echo, show_found
-from robotid.cli.flags import JOB, SOURCE, add_json
+from robotid.cli.job import JOB, SOURCE, add_shown
 from robotid.data.base_motion import ACCELERATION, IMU, POSE, TWIST
 from robotid.data.files.columns import KINDS, is_clock, quantity_of
-from robotid.data.files.formats import open_table, write_columns
+from robotid.data.files.read import open_table, write_columns
 from robotid.data.files.table import with_even_stamps
 from robotid.data.log import repeated, suggestion
 from robotid.data.signal_settings import LogSource
@@ -25,25 +24,13 @@ _SENSED = {*_BASE, *(f"imu_{x}" for x in IMU)}
 _OF_LINKS = ("contact_", "foot_force_", *(f"wrench_{x}_" for x in Contact.components))
 
 
-@dataclass(frozen=True)
-class Conversion:
-    """The content of a converted file."""
-
-    path: str
-    samples: int
-    columns: tuple[str, ...]  # with standard names
-    joints: tuple[str, ...]
-    ignored: tuple[str, ...]  # columns of the source file that are of no joint, base or contact
-    local: bool = False  # whether it has wrenches with the axes of their links
-
-
 def convert(
     path: str | Path,
     target: str | Path,
     *,
     joints: Sequence[str] | None = None,
     source: LogSource = _WHOLE,
-) -> Conversion:
+) -> dict[str, Any]:
     """Write a log in another format, with standard column names; no robot model is required."""
     file = Path(path)
     check_file(Path(target), [file])
@@ -63,14 +50,12 @@ def convert(
     even = with_even_stamps(opened, found["time"], source.stamp)
     table = even.read([found[name] for name in columns])
     write_columns({name: table[found[name]] for name in columns}, Path(target))
-    return Conversion(
-        path=str(target),
-        samples=len(table[found["time"]]),
-        columns=tuple(columns),
-        joints=wanted,
-        ignored=tuple(name for name in opened.names if name not in found.values()),
-        local=opened.axes.get("wrench") == "link" and any(x.startswith("wrench_") for x in others),
-    )
+    is_local = opened.axes.get("wrench") == "link" and any(x.startswith("wrench_") for x in others)
+    return {
+        "path": str(target), "samples": len(table[found["time"]]), "columns": columns,
+        "joints": list(wanted), "local": is_local,  # wrenches with the axes of their links
+        "ignored": [name for name in opened.names if name not in found.values()],
+    }  # fmt: skip
 
 
 def _standard_names(
@@ -106,28 +91,20 @@ def _standard_names(
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add = parser.add_argument
     add("log", metavar="IN", help="log of any format, or the folder of a bag")
     add("out", metavar="OUT", help="file to write; its suffix determines the format")
     add("--joints", metavar="A,B,...", help="joints to write; default: all")
     add("--sensors", metavar="A,B,...", help="topics of base, IMU and forces; default: all")
     JOB.add(parser, SOURCE)
-    add_json(parser)
+    add_shown(parser, "json")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     joints = options.joints.split(",") if options.joints else None
     topics = tuple(options.sensors.split(",")) if options.sensors else ()
-    source = LogSource(**source_settings(options), sensors=topics)
-    done = convert(options.log, options.out, joints=joints, source=source)
-    show_found(asdict(done), options, _show)
-
-
-def source_settings(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the settings of a ``LogSource`` that the flags state, by name."""
-    return dict(JOB.stated(options, SOURCE).get("log", {}))
+    source = LogSource(**JOB.stated(options, SOURCE).get("log", {}), sensors=topics)
+    show_found(convert(options.log, options.out, joints=joints, source=source), options, _show)
 
 
 def _show(done: dict[str, Any]) -> None:

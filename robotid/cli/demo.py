@@ -9,9 +9,8 @@ import numpy as np
 from robotid.base.files import check_folder
 from robotid.base.typing import Array, ProgressCallback
 from robotid.cli.console import echo, print_files, progress_of
-from robotid.cli.flags import add_out
 from robotid.cli.identify import run_job, show_result
-from robotid.cli.job import Job, LogEntry
+from robotid.cli.job import Job, LogEntry, add_out
 from robotid.data.files.read import write_log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.simulation.motions import random_fourier
@@ -47,13 +46,9 @@ def run_demo(
         write_log(log, target / f"{name}.csv")
         entries.append(LogEntry(target / f"{name}.csv"))
     job = Job(
-        urdf=Path(model.tree.path),
-        locked=_LOCKED,
-        signals=SignalSettings(cutoff=10.0),
-        identification=(entries[0],),
-        validation=(entries[1],),
-        replay=True,
-    )
+        urdf=Path(model.tree.path), locked=_LOCKED, signals=SignalSettings(cutoff=10.0),
+        identification=(entries[0],), validation=(entries[1],), replay=True,
+    )  # fmt: skip
     found, result = run_job(job, target, plan=WorkPlan(progress=progress))
     identification = cast(TorqueIdentification, found)  # of the default estimator
     true = dict(zip(model.layout.names, truth, strict=True))
@@ -63,12 +58,10 @@ def run_demo(
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add_out(parser, "robotid-demo")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     echo("simulating a Unitree Z1 arm whose masses, armature and friction differ from its URDF ...")
     with progress_of(options) as progress:
         identification, result, truth = run_demo(options.out, progress=progress)

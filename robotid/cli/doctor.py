@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import Any
 
 from robotid.base.findings import Finding, grouped
+from robotid.base.settings import require_kind
 from robotid.cli.console import echo, print_causes, progress_of, show_found
-from robotid.cli.flags import add_job, job_from_flags
-from robotid.cli.job import job_file
+from robotid.cli.job import add_job, add_shown, job_file, job_from_flags
 from robotid.cli.logs import examine
 from robotid.data.files.read import Readable
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.logs.check_logs import check_logs, findings_to_dict
+from robotid.diagnosis.logs.check_logs import diagnose, findings_to_dict
 from robotid.diagnosis.verdict.verdict import blocking
-from robotid.identification.pipeline import robot_of
+from robotid.identification.pipeline import logs_of, robot_of
 from robotid.robot.model import RobotModel
 
 
@@ -43,16 +43,18 @@ def doctor(
     """
     if logs is None:
         return examine(job_file(model))
-    return check_logs(robot_of(model, logs), logs, validation=validation, signals=signals)
+    require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
+    model = robot_of(model, logs)
+    fitted, held_out = (logs_of(model, some, needs="any") for some in (logs, validation))
+    return diagnose(model, fitted, held_out, signals or SignalSettings())
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add_job(parser)
+    add_shown(parser, "json", "verbose")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the command."""
     with progress_of(options) as progress:
         job = job_from_flags(options)
         model = job.model()

@@ -14,8 +14,7 @@ from robotid.base.files import check_file
 from robotid.base.findings import listed
 from robotid.base.typing import ProgressCallback
 from robotid.cli.console import echo, print_files, progress_of, show_found
-from robotid.cli.flags import JOB, ROBOT, Flags, add_json, add_progress, job_from_flags, number
-from robotid.cli.job import Job, as_job
+from robotid.cli.job import JOB, ROBOT, Flags, Job, add_shown, as_job, job_from_flags, number
 from robotid.cli.logs import result_run
 from robotid.data.log import Log
 from robotid.design.clearance import Box, Clearance
@@ -106,19 +105,12 @@ def _designer(
         )
     model.require_fixed("motion design")
     limits = MotionLimits.of_model(
-        model,
-        share=settings.share,
-        velocity=settings.velocity,
-        torque=settings.torque,
-        acceleration=settings.acceleration,
-        jerk=settings.jerk,
-        power=settings.power,
-    )
-    clearance = None
-    if settings.clearance is not None:
-        clearance = Clearance(
-            model, least=settings.clearance, floor=settings.floor, boxes=settings.boxes
-        )
+        model, share=settings.share, velocity=settings.velocity, torque=settings.torque,
+        acceleration=settings.acceleration, jerk=settings.jerk, power=settings.power,
+    )  # fmt: skip
+    clearance, least = None, settings.clearance
+    if least is not None:
+        clearance = Clearance(model, least=least, floor=settings.floor, boxes=settings.boxes)
     basis = FourierBasis(settings.duration, settings.harmonics)
     designer = Designer.of_model(
         model, basis, limits, name=name, clearance=clearance, noise=settings.noise, run=run
@@ -171,43 +163,31 @@ def _content(
     """Return the design as plain values."""
     model, names = designer.information.model, designer.information.mapping.base_names
     margins: dict[str, Any] = {}
-    limits, clearance = course.limits, course.clearance
-    jerk = LIMITS.index("jerk")
-    most = design.used.copy()
+    jerk, most, clearance = LIMITS.index("jerk"), design.used.copy(), course.clearance
     if settings.kind in ROUTES:
         most[jerk] = course.largest[jerk]
-    for name, used, sizes in zip(LIMITS, most, limits.sizes, strict=True):
+    for name, used, sizes in zip(LIMITS, most, course.limits.sizes, strict=True):
         if np.isfinite(sizes).any():
             joint = int(np.argmax(used))
             margins[name] = {"margin": 1.0 - float(used[joint]), "where": model.joints[joint]}
     if clearance is not None:
         contact = design.contact
         margins["collision"] = {
-            "margin": None if contact is None else contact.margin,
-            "kept": None if contact is None else contact.required,
-            "where": None if contact is None else f"{contact.first} and {contact.second}",
-            "time": None if contact is None else contact.time,
-            "unread": clearance.unread,
-            "left_alone": clearance.made_to,
-            "built_near": clearance.built_near,
-        }
+            "margin": contact and contact.margin, "kept": contact and contact.required,
+            "where": contact and f"{contact.first} and {contact.second}",
+            "time": contact and contact.time, "unread": clearance.unread,
+            "left_alone": clearance.made_to, "built_near": clearance.built_near,
+        }  # fmt: skip
     content = {
-        "robot": model.name,
-        "joints": list(model.joints),
-        "criterion": designer.name,
+        "robot": model.name, "joints": list(model.joints), "criterion": designer.name,
         "objective": design.objective,
         "condition_number": design.condition if np.isfinite(design.condition) else None,
-        "seconds": design.seconds,
-        "starts": design.starts,
-        "converged": bool(design.is_converged),
+        "seconds": design.seconds, "starts": design.starts, "converged": bool(design.is_converged),
         "feasible": all((m["margin"] or 0.0) >= 0.0 for m in margins.values()),
-        "kind": settings.kind,
-        "share": settings.share,
-        "duration": design.duration,
-        "points": settings.points,
-        "limits": margins,
+        "kind": settings.kind, "share": settings.share, "duration": design.duration,
+        "points": settings.points, "limits": margins,
         "history": [list(entry) for entry in design.history],
-    }
+    }  # fmt: skip
     if designer.name == "widest":
         content["widest"] = [names[k] for k in designer.widest[::-1]]
     return content
@@ -224,7 +204,6 @@ EXAMPLES = (
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add = parser.add_argument
     add("source", metavar="JOB.toml | URDF")
     words = "motion to write: .csv, .parquet, .yaml (ROS 2 JointTrajectory) or .script (UR)"
@@ -234,16 +213,13 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     words = "page to write about the motion: limits over time, expected standard errors"
     add("--report", metavar="PAGE.html", help=words)
     _MOTION.add(parser)
-    add_json(parser)
-    add_progress(parser)
+    add_shown(parser, "json", "progress")
     flags = parser.add_argument_group("the robot, instead of a job file")
     JOB.add(flags, ROBOT[:3])
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
-    options.logs = []
-    job = job_from_flags(options, needs_logs=False)
+    job = job_from_flags(options)
     settings = motion_settings(options)
     with progress_of(options) as progress:
         content = excite(
@@ -256,7 +232,6 @@ def run(options: argparse.Namespace) -> None:
 
 
 def motion_settings(options: argparse.Namespace) -> MotionSettings:
-    """Return the settings of the motion that the flags state."""
     return MotionSettings.from_dict(_MOTION.stated(options))
 
 
@@ -315,11 +290,10 @@ _MOTION = Flags(
 
 
 def _show(content: dict[str, Any]) -> None:
-    done = f"in {content['seconds']:.1f} s"
-    if content["starts"]:
-        plural = "start" if content["starts"] == 1 else "starts"
-        done = f"{content['starts']} {plural} {done}, "
-        done += "converged" if content["converged"] else "not converged: increase --seconds"
+    done, count = f"in {content['seconds']:.1f} s", content["starts"]
+    if count:
+        end = "converged" if content["converged"] else "not converged: increase --seconds"
+        done = f"{count} {'start' if count == 1 else 'starts'} {done}, {end}"
     condition = content["condition_number"]
     echo(
         f"{content['robot']}: a motion of {content['duration']:g} s for {len(content['joints'])} "
@@ -340,14 +314,12 @@ def _margin(name: str, margin: Mapping[str, Any]) -> str:
         return f"{100 * margin['margin']:5.1f} %  {margin['where']}"
     text = "no pair of links or obstacles comes close"
     if margin["margin"] is not None:
-        distance, time = 1e3 * margin["margin"], margin["time"]
-        clearance = 1e3 * margin["kept"]
-        where = f"{margin['where']} at {time:.2f} s"
-        text = f"{distance:5.1f} mm above the clearance of {clearance:.0f} mm, {where}"
-    if margin["unread"]:
-        text += f"; not checked, shapes not readable: {listed(margin['unread'])}"
-    if margin["left_alone"]:
-        text += f"; not checked, in contact by design: {listed(margin['left_alone'])}"
-    if margin["built_near"]:
-        text += f"; smaller clearance, close by design: {listed(margin['built_near'])}"
+        text = f"{1e3 * margin['margin']:5.1f} mm above the clearance of "
+        text += f"{1e3 * margin['kept']:.0f} mm, {margin['where']} at {margin['time']:.2f} s"
+    for key, words in (
+        ("unread", "not checked, shapes not readable"),
+        ("left_alone", "not checked, in contact by design"),
+        ("built_near", "smaller clearance, close by design"),
+    ):
+        text += f"; {words}: {listed(margin[key])}" if margin[key] else ""
     return text

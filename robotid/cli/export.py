@@ -10,8 +10,8 @@ from robotid.base.exceptions import SettingsError
 from robotid.base.files import check_file
 from robotid.base.findings import listed
 from robotid.cli.console import echo, show_found
-from robotid.cli.flags import add_json
 from robotid.cli.identify import save_result
+from robotid.cli.job import add_shown
 from robotid.identification.result import Identification
 from robotid.output.files.exports import formats, options_of, writers
 from robotid.output.files.result_file import load_result
@@ -65,7 +65,6 @@ def export(
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add = parser.add_argument
     add("result", metavar="RESULT", help="result.json or its folder")
     words = {kind: form.words for kind, form in formats().items()}
@@ -78,7 +77,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         if first.among:
             about = {"choices": first.among}
         add(f"--{name.replace('_', '-')}", help=_by_format(words), **about)
-    add_json(parser)
+    add_shown(parser, "json")
 
 
 def _by_format(words: Mapping[str, str]) -> str:
@@ -86,7 +85,6 @@ def _by_format(words: Mapping[str, str]) -> str:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     chosen = {name: getattr(options, name) for name in options_of(formats())}
     show_found(export(options.result, options.format, options.out, **chosen), options, _show)
 

@@ -4,6 +4,7 @@ import argparse
 import hashlib
 import json
 import shutil
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,9 +23,17 @@ from robotid.base.files import (
 )
 from robotid.base.versions import __version__, code_versions
 from robotid.cli.console import echo, progress_of, show_found
-from robotid.cli.flags import add_json, add_out, add_progress
 from robotid.cli.identify import identify_job
-from robotid.cli.job import Job, LogEntry, PayloadEntry, read_job, stated_path
+from robotid.cli.job import (
+    Job,
+    LogEntry,
+    PayloadEntry,
+    add_out,
+    add_shown,
+    add_work,
+    read_job,
+    stated_path,
+)
 from robotid.data.files.parquet_files import read_text_table, write_rows
 from robotid.data.log import suggestion
 from robotid.dynamics.factors import available_cores
@@ -64,13 +73,11 @@ class FleetUnit(Workload):
 
     @property
     def name(self) -> str:
-        """Name in messages."""
         return f"unit {self.unit}"
 
     @property
     def samples(self) -> int:
-        """Number of its logs, which the progress counts."""
-        return len(self.logs)
+        return len(self.logs)  # which the progress counts
 
     def stated(self) -> Job:
         """Return the job of the unit."""
@@ -103,13 +110,12 @@ def read_fleet(
     names, rows = read_text_table(source)
     for name in ("unit", "log"):
         if name not in names:
-            near = suggestion(name, names)
             raise DataError(
                 f"{source.name} has no column {name!r} ({COLUMNS[name]}); columns: "
-                f"{', '.join(names)}{near}"
+                f"{', '.join(names)}{suggestion(name, names)}"
             )
+    missing = [known for known in COLUMNS if known not in names]
     for name in names:
-        missing = [known for known in COLUMNS if known not in names]
         if name not in COLUMNS and (near := suggestion(name, missing)):
             raise DataError(
                 f"{source.name} has an unknown column {name!r}{near} Rename it; columns that are "
@@ -117,82 +123,80 @@ def read_fleet(
             )
     if not rows:
         raise DataError(f"{source.name} has no rows, wanted one for each log")
-    by_unit: dict[str, list[tuple[int, dict[str, str]]]] = {}
-    for number, row in enumerate(rows, start=1):
+    by_unit: dict[str, list[_Row]] = {}
+    for number, cells in enumerate(rows, start=1):
+        row = _Row(source, number, cells)
         for name in ("unit", "log"):
-            if not row[name]:
-                raise DataError(
-                    f"{source.name} row {number}, column {name!r}: no value, wanted the "
-                    f"{COLUMNS[name]}; fill it in, or remove the row"
-                )
-        by_unit.setdefault(row["unit"], []).append((number, row))
-    return [_unit(source, name, own, urdf, job) for name, own in by_unit.items()]
+            if not cells[name]:
+                raise row.error(name, f"no value, wanted the {COLUMNS[name]}; fill it in, or "
+                                "remove the row")  # fmt: skip
+        by_unit.setdefault(cells["unit"], []).append(row)
+    return [_unit(name, of_unit, urdf, job) for name, of_unit in by_unit.items()]
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A row of the table."""
+
+    source: Path
+    number: int
+    cells: Mapping[str, str]
+
+    def error(self, column: str, words: str) -> DataError:
+        """Return the error of a column."""
+        return DataError(f"{self.source.name} row {self.number}, column {column!r}: {words}")
+
+    def path(self, column: str) -> Path:
+        """Return a path, relative to the table, with $VARIABLES replaced as in job files."""
+        where = f"{self.source.name} row {self.number}, column {column!r}"
+        try:
+            return stated_path(self.cells[column], where, self.source.parent, expand=True)
+        except SettingsError as error:
+            raise DataError(str(error)) from error
+
+    @property
+    def payload(self) -> float | None:
+        """The payload [kg], None without one."""
+        text = self.cells.get("payload", "")
+        try:
+            mass = float(text or 0.0)
+        except ValueError:
+            mass = float("nan")
+        if not 0.0 <= mass < 1e6:
+            raise self.error("payload", f"{text!r}, wanted a mass in kg, 0 or empty for none")
+        return mass or None
 
 
 def _unit(
-    source: Path,
-    name: str,
-    rows: Sequence[tuple[int, Mapping[str, str]]],
-    urdf: str | Path | None,
-    job: str | Path | None,
+    name: str, rows: Sequence[_Row], urdf: str | Path | None, job: str | Path | None
 ) -> FleetUnit:
     """Return a unit of the table from its rows."""
-    first, stated = rows[0]
-    for column in ("urdf", "job"):
-        for number, row in rows:
-            if row.get(column, "") != stated.get(column, ""):
-                raise DataError(
-                    f"{source.name} row {number}, column {column!r}: {row[column]!r}, but row "
-                    f"{first} of the unit {name!r} has {stated[column]!r}; state the same for all "
-                    "logs of a unit, or other names of units"
+    first, seen = rows[0], dict[str, int]()
+    for row in rows:
+        for column in ("urdf", "job"):
+            text, wanted = row.cells.get(column, ""), first.cells.get(column, "")
+            if text != wanted:
+                raise row.error(
+                    column,
+                    f"{text!r}, but row {first.number} of the unit {name!r} has {wanted!r}; state "
+                    "the same for all logs of a unit, or other names of units",
                 )
-    seen: dict[str, int] = {}
-    logs = []
-    for number, row in rows:
-        if row["log"] in seen:
-            raise DataError(
-                f"{source.name} row {number}, column 'log': {row['log']!r} is in row "
-                f"{seen[row['log']]}, too; remove one of the rows"
-            )
-        seen[row["log"]] = number
-        mass = _mass(source, number, row.get("payload", ""))
-        logs.append((_path(source, number, "log", row["log"]), mass))
-    own_urdf, own_job = (
-        _path(source, first, column, stated[column])
-        if stated.get(column)
-        else default and Path(default)
-        for column, default in (("urdf", urdf), ("job", job))
-    )
-    if not (own_urdf or own_job):
-        raise DataError(
-            f"{source.name} row {first}, column 'urdf': the unit {name!r} has no URDF; fill it in, "
-            "or state one for all units with --urdf"
-        )
-    return FleetUnit(name, tuple(logs), own_urdf or None, own_job or None)
-
-
-def _path(source: Path, number: int, column: str, text: str) -> Path:
-    """Return a path of a row, relative to the table, with $VARIABLES replaced as in job files."""
-    try:
-        return stated_path(
-            text, f"{source.name} row {number}, column {column!r}", source.parent, expand=True
-        )
-    except SettingsError as error:
-        raise DataError(str(error)) from error
-
-
-def _mass(source: Path, number: int, text: str) -> float | None:
-    """Return the payload of a row [kg]; None without one."""
-    try:
-        mass = float(text or 0.0)
-    except ValueError:
-        mass = float("nan")
-    if not 0.0 <= mass < 1e6:
-        raise DataError(
-            f"{source.name} row {number}, column 'payload': {text!r}, wanted a mass in kg, 0 or "
-            "empty for none"
-        )
-    return mass or None
+        log = row.cells["log"]
+        if log in seen:
+            raise row.error("log", f"{log!r} is in row {seen[log]}, too; remove one of the rows")
+        seen[log] = row.number
+    of_unit = {"urdf": urdf, "job": job}
+    files = {
+        column: first.path(column) if first.cells.get(column) else path and Path(path)
+        for column, path in of_unit.items()
+    }
+    if not any(files.values()):
+        raise first.error(
+            "urdf", f"the unit {name!r} has no URDF; fill it in, or state one for all units with "
+            "--urdf"
+        )  # fmt: skip
+    logs = tuple((row.path("log"), row.payload) for row in rows)
+    return FleetUnit(name, logs, files["urdf"] or None, files["job"] or None)
 
 
 def identify_unit(unit: FleetUnit, threads: int | None) -> UnitRows:
@@ -202,11 +206,11 @@ def identify_unit(unit: FleetUnit, threads: int | None) -> UnitRows:
     rows: UnitRows = []
     try:
         job = unit.stated()
-        found = identify_job(
+        identification = identify_job(
             job, job.model(), WorkPlan(1),
             refuse=lambda entry, error: refused.update({entry.path: str(error)}),
         )  # fmt: skip
-        result = build_result(found, job.to_dict())
+        result = build_result(identification, job.to_dict())
         used = [e.path for e in job.identification if e.path not in refused]
         rows += _rows(unit.unit, used, result)
     except Exception as error:  # the fleet goes on: the error is in the table, with its type
@@ -247,14 +251,10 @@ def _rows(unit: str, logs: Sequence[Path], result: Mapping[str, Any]) -> Iterato
 
 
 def run_fleet(
-    units: Sequence[FleetUnit],
-    folder: str | Path,
-    *,
-    plan: WorkPlan | None = None,
-    resume: bool = False,
+    units: Sequence[FleetUnit], folder: str | Path, *, plan: WorkPlan, resume: bool = False
 ) -> dict[str, Any]:
     """Identify all units; write fleet.parquet, fleet.json and fleet.html when all are finished."""
-    chosen, target = plan or WorkPlan(1), Path(folder)
+    target = Path(folder)
     check_folder(target, _FILES)
     if not resume:
         shutil.rmtree(target / UNITS, ignore_errors=True)
@@ -262,8 +262,8 @@ def run_fleet(
     stored = {unit.unit: target / UNITS / f"{_key(unit)}.json" for unit in units}
     missing = [unit for unit in units if not stored[unit.unit].exists()]
     failed: dict[str, UnitRows] = {}
-    with chosen:
-        for k, rows in chosen.as_finished(
+    with plan:
+        for k, rows in plan.as_finished(
             identify_unit, missing, "identifying", counted="logs",
             lost=lambda unit, error: [_failure(unit, error)],
         ):  # fmt: skip
@@ -307,9 +307,10 @@ class _Gathered:
     """What the page and the variation between units need of all results."""
 
     def __init__(self) -> None:
-        self._values: dict[tuple[str, str, str, str], list[tuple[str, float, float]]] = {}
+        # by robot, parameter, expression and unit of the parameter: the estimates of the units
+        self._values = defaultdict[tuple[str, ...], list[tuple[str, float, float]]](list)
         self._failures: list[dict[str, str]] = []
-        self._verdicts: dict[str, int] = {}
+        self._verdicts = Counter[str]()
 
     def add(self, rows: UnitRows) -> None:
         """Add the result of a unit."""
@@ -319,36 +320,31 @@ class _Gathered:
                 self._failures.append(shown)
             elif "log" not in row and row.get("std_error"):
                 key = row["robot"], row["parameter"], row["expression"], row["parameter_unit"]
-                own = row["unit"], row["value"], row["std_error"]
-                self._values.setdefault(key, []).append(own)
-        verdict = next((row["verdict"] for row in rows if row.get("verdict")), None)
-        if verdict is not None:
-            self._verdicts[verdict] = self._verdicts.get(verdict, 0) + 1
+                self._values[key].append((row["unit"], row["value"], row["std_error"]))
+        self._verdicts.update([row["verdict"] for row in rows if row.get("verdict")][:1])
 
     def content(self, units: Sequence[FleetUnit]) -> dict[str, Any]:
         """Return the content of fleet.json."""
-        several = {key: own for key, own in self._values.items() if len(own) >= FEWEST_RUNS}
+        several = {key: found for key, found in self._values.items() if len(found) >= FEWEST_RUNS}
         n_tests = sum(map(len, several.values()))
         parameters, unlike = [], []
-        for (robot, name, expression, unit), own in several.items():
-            values, errors = (np.array([each[k] for each in own]) for k in (1, 2))
-            found = between_units(values, errors, FALSE_ALARMS / n_tests)
-            if found is None:
+        for (robot, name, expression, unit), estimates in several.items():
+            names, values, errors = zip(*estimates, strict=True)
+            varied = between_units(np.array(values), np.array(errors), FALSE_ALARMS / n_tests)
+            if varied is None:
                 continue
-            prediction, different = found
-            parameters.append(
-                {
-                    "robot": robot, "name": name, "expression": expression, "unit": unit,
-                    "units": len(own), "mean": prediction.mean, "std_error": prediction.std_error,
-                    "spread": prediction.spread, "spread_interval": prediction.spread_ends.tolist(),
-                    "next_interval": prediction.ends.tolist(), "values": values.tolist(),
-                }
-            )  # fmt: skip
+            prediction, different = varied
+            ends = prediction.ends.tolist()
+            parameters.append({
+                "robot": robot, "name": name, "expression": expression, "unit": unit,
+                "units": len(values), "mean": prediction.mean, "std_error": prediction.std_error,
+                "spread": prediction.spread, "spread_interval": prediction.spread_ends.tolist(),
+                "next_interval": ends, "values": list(values),
+            })  # fmt: skip
             unlike += [
                 {
-                    "unit": own[k][0], "parameter": name, "value": own[k][1],
-                    "std_error": own[k][2], "parameter_unit": unit,
-                    "others": prediction.ends.tolist(), "probability": probability,
+                    "unit": names[k], "parameter": name, "value": values[k], "std_error": errors[k],
+                    "parameter_unit": unit, "others": ends, "probability": probability,
                 }
                 for k, probability in different
             ]  # fmt: skip
@@ -356,10 +352,10 @@ class _Gathered:
             "units": len(units),
             "logs": sum(len(unit.logs) for unit in units),
             "done": sum(self._verdicts.values()),
-            "verdicts": self._verdicts,
+            "verdicts": dict(self._verdicts),
             "failures": self._failures,
             "parameters": parameters,
-            "unlike": sorted(unlike, key=lambda each: each["probability"]),
+            "unlike": sorted(unlike, key=lambda entry: entry["probability"]),
         }
 
 
@@ -367,26 +363,19 @@ _SHOWN = 10  # failures and units that differ
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add = parser.add_argument
     words = "table, .csv or .parquet, with columns unit, log, and optionally urdf, payload, job"
     add("table", metavar="TABLE", help=words)
     add("--urdf", metavar="FILE", help="URDF of the units whose rows have none")
     add("--job", metavar="JOB.toml", help="settings of the units whose rows have no job")
     add_out(parser, "robotid-fleet")
-    group = parser.add_mutually_exclusive_group()
-    words = "worker processes; default: one per core"
-    group.add_argument("--workers", type=int, metavar="N", help=words)
-    words = "address of a Dask cluster, as tcp://host:8786"
-    group.add_argument("--scheduler", metavar="ADDRESS", help=words)
+    add_work(parser.add_mutually_exclusive_group(), "one per core")
     words = "keep the units of --out that were identified and whose inputs have not changed"
     add("--resume", action="store_true", help=words)
-    add_json(parser)
-    add_progress(parser)
+    add_shown(parser, "json", "progress")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the command."""
     with progress_of(options) as progress:
         units = read_fleet(options.table, options.urdf, options.job)
         workers = available_cores() if options.workers is None else options.workers
@@ -401,16 +390,15 @@ def _show(content: Mapping[str, Any]) -> None:
     shown = f" ({verdicts})" if verdicts else ""
     echo(f"{content['done']} of {content['units']} units identified{shown}, {content['logs']} logs")
     failures, unlike = content["failures"], content["unlike"]
-    for each in failures[:_SHOWN]:
-        echo(f"failed: {each['unit']}{': ' * bool(each['log'])}{each['log']}: {each['error']}",
-             "  ")  # fmt: skip
-    for each in unlike[:_SHOWN]:
-        low, high = (f"{x:.3g}" for x in each["others"])
+    for failure in failures[:_SHOWN]:
+        place = ": ".join(filter(None, (failure["unit"], failure["log"])))
+        echo(f"failed: {place}: {failure['error']}", "  ")
+    for entry in unlike[:_SHOWN]:
+        low, high = (f"{x:.3g}" for x in entry["others"])
         echo(
-            f"differs: {each['unit']}: {each['parameter']} is {each['value']:.4g} +- "
-            f"{each['std_error']:.2g} {each['parameter_unit']}; the other units predict {low} to "
+            f"differs: {entry['unit']}: {entry['parameter']} is {entry['value']:.4g} +- "
+            f"{entry['std_error']:.2g} {entry['parameter_unit']}; the other units predict {low} to "
             f"{high}", "  ",
         )  # fmt: skip
-    more = max(len(failures) - _SHOWN, 0) + max(len(unlike) - _SHOWN, 0)
-    if more:
+    if more := len(failures[_SHOWN:]) + len(unlike[_SHOWN:]):
         echo(f"{more} more failures or differences: fleet.html")

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import check_folder, folder_beside, remove_written, write_json
@@ -23,11 +23,28 @@ from robotid.cli.console import (
     recordings_of,
     show_found,
 )
-from robotid.cli.flags import OUTPUT, add_job, add_out, add_progress, job_from_flags, source_words
-from robotid.cli.job import Job, LogEntry, job_file
-from robotid.cli.logs import examine_logs, locked_as_logged, needed_of, survey_logs, units_of_logs
+from robotid.cli.job import (
+    OUTPUT,
+    Job,
+    LogEntry,
+    add_job,
+    add_out,
+    add_shown,
+    add_work,
+    job_file,
+    job_from_flags,
+    source_words,
+)
+from robotid.cli.logs import (
+    Refuse,
+    examine_logs,
+    locked_as_logged,
+    needed_of,
+    survey_logs,
+    units_of_logs,
+)
 from robotid.cli.payload import check_payloads
-from robotid.data.files.read import Readable, read_logs
+from robotid.data.files.read import Readable
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import diagnose
@@ -41,7 +58,7 @@ from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.work_plan import WorkPlan
 from robotid.identification import pipeline
 from robotid.identification.closed_loop.loop_settings import LoopSettings
-from robotid.identification.pipeline import conclude, robot_of
+from robotid.identification.pipeline import conclude, logs_of, robot_of
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.identification.summary import (
     error_lines,
@@ -84,27 +101,23 @@ def identify(
     Args:
         model: The robot, or the path of its URDF with all joints free; or a job file, alone, which
             states logs and settings, and whose long logs are read in pieces.
-        logs: Logs to fit: a ``Log`` with the model's joints, the path of a file, a DataFrame with
-            the columns of such a file, or several of these. Files are read whole, as by
-            ``read_log``.
+        logs: Logs to fit, one or several: a ``Log`` with the model's joints, the path of a file, or
+            a DataFrame with its columns. Files are read whole, as by ``read_log``.
         validation: Logs for validation, of the same types.
         signals: Settings of the signal processing; the defaults if None.
         estimator: Name or settings of the estimator. "simulation" simulates the robot on the
             commands, or on the torques, of the logs.
-        controller: Known properties of the position controllers, with the keys of the table
-            ``[controller]`` of a job file; only for the estimator "simulation".
-        friction: Friction terms in addition to viscous and Coulomb friction, as of
-            ``wanted_families``; "auto" selects them. Simulation selects those of all joints, or
-            of none.
+        controller: Known properties of the position controllers, the keys of ``[controller]`` of a
+            job file; only for the estimator "simulation".
+        friction: Terms in addition to viscous and Coulomb friction, as of ``wanted_families``;
+            "auto" selects them. Simulation selects those of all joints, or of none.
         doctor: Whether the doctor checks the logs first; its findings count in the verdict.
         ignore: Codes of errors and warnings to ignore.
         progress: Called at the start of each stage with its name, the stages done, their number
-            and "stages"; in between with the name of a work, the units done, their number and
-            their name.
+            and "stages"; in between with a work, the units done, their number and their name.
 
     Returns:
-        The identification; its evaluations are of torques, or for the estimator "simulation" of
-            positions.
+        The identification; its evaluations are of torques, or by "simulation" of positions.
 
     Raises:
         DataError: If a log cannot be read, does not match the model or is too short.
@@ -138,7 +151,6 @@ def identify(
             friction=friction, doctor=doctor, ignore=ignore, progress=progress,
         )  # fmt: skip
     from robotid.identification.closed_loop.from_commands import identify_loops
-    from robotid.identification.closed_loop.loop_settings import LoopSettings
     from robotid.identification.closed_loop.stages import STAGES
 
     require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
@@ -154,17 +166,7 @@ def identify(
             "friction is stated by joint or with families, but simulation selects the terms of all "
             "joints, or of none; wanted 'auto' or 'viscous+coulomb'. State terms in the model"
         )
-    needs: Literal["torque", "commands"] = "torque" if loop.kind == "torque" else "commands"
-    fitted, held_out = (
-        read_logs(
-            some,
-            model.joints,
-            prismatic=model.layout.prismatic,
-            needs=needs,
-            robot=model.tree.movable,
-        )
-        for some in (logs, validation)
-    )
+    fitted, held_out = (logs_of(model, some, needed_of(loop)) for some in (logs, validation))
     return identify_loops(
         model, fitted, held_out, loop, choice, signals=settings, chooses=None in wanted,
         examined=diagnose(model, fitted, held_out, settings) if doctor else (), ignore=ignore,
@@ -176,12 +178,11 @@ def run_job(
     job: Job, folder: str | Path, *, plan: WorkPlan | None = None, source: Sequence[str] = ()
 ) -> tuple[Identification, dict[str, Any]]:
     """Identify and write result.json, report and URDF; return the result and result.json."""
-    chosen, target = plan or WorkPlan(job.workers or 1), Path(folder)
-    model = job.model()
+    plan, target, model = plan or WorkPlan(job.workers or 1), Path(folder), job.model()
     check_folder(target, ["result.json", *_names(model)])
-    found = identify_job(job, model, chosen)
-    report_stage(chosen.progress, "writing", _stages(job))
-    return _write(found, _job_of(found), target, source=source)
+    identification = identify_job(job, model, plan)
+    report_stage(plan.progress, "writing", _stages(job))
+    return _write(identification, _job_of(identification), target, source=source)
 
 
 def save_result(
@@ -189,10 +190,9 @@ def save_result(
 ) -> Path:
     """Write the files of ``robotid identify``: result.json, report, URDF with its sidecar.
 
-    ``robotid.load_result(folder)``, ``robotid validate`` and ``robotid replay`` read them. All
-    files are first written to a temporary folder and moved when they are complete. An impossible
-    result has no URDF. Logs in files are listed with their hashes. Gains, units and column names
-    with which the logs were read in Python are not recorded.
+    All files are first written to a temporary folder and moved when they are complete. An
+    impossible result has no URDF. Logs in files are listed with their hashes. Gains, units and
+    column names with which the logs were read in Python are not recorded.
 
     Args:
         identification: The identification.
@@ -208,8 +208,8 @@ def save_result(
         ModelError: If the URDF of the robot no longer exists.
         SettingsError: If the folder is a file, or is not writable.
     """
-    kind = "a robotid.Identification"
-    require_kind(identification, Identification, "identification", kind)
+    wanted = "a robotid.Identification"
+    require_kind(identification, Identification, "identification", wanted)
     require_kind(folder, (str, Path), "folder", "the path of a folder")
     require_kind(report, bool, "report", "True or False")
     require_kind(replay, bool, "replay", "True or False")
@@ -222,48 +222,46 @@ def save_result(
 
 def _names(model: RobotModel) -> tuple[str, str, str, str]:
     """Return the names of report, replay, URDF and sidecar."""
-    name = f"{Path(model.tree.path).stem}.identified.urdf"
-    return "report.html", "replay.html", name, str(Path(name).with_suffix(".drive.json"))
+    stem = Path(model.tree.path).stem
+    return "report.html", "replay.html", f"{stem}.identified.urdf", f"{stem}.identified.drive.json"
 
 
 def _write(
-    found: Identification, job: Job, target: Path, *, source: Sequence[str] = ()
+    identification: Identification, job: Job, target: Path, *, source: Sequence[str] = ()
 ) -> tuple[Identification, dict[str, Any]]:
     """Write all files of a result; return the identification with its report, and result.json."""
-    names = report, replay, name, sidecar = _names(found.model)
+    model = identification.model
+    names = report, replay, urdf, sidecar = _names(model)
     target.mkdir(parents=True, exist_ok=True)
     with folder_beside(target) as partial:
         outputs = {}
         played = {"replay": replay} if job.replay else {}
-        written = {"urdf": name, "sidecar": sidecar} if found.has_urdf else {}
+        written = {"urdf": urdf, "sidecar": sidecar} if identification.has_urdf else {}
         if job.report:
-            found = replace(found, report=str(target / report))
+            identification = replace(identification, report=str(target / report))
             links = {"result": "result.json", **written, **played}
             origin = Origin(tuple(source), str(target), replay)
-            write_report(found, partial / report, files=links, origin=origin)
+            write_report(identification, partial / report, files=links, origin=origin)
             outputs["report"] = report
         if written:
-            model, pi = found.model, found.standard
-            moments = found.moments if job.dynamics else {}
+            pi, moments = identification.standard, identification.moments if job.dynamics else {}
             dynamics = job.dynamics and project_friction(model, pi, moments, DYNAMICS_TERMS)
-            write_urdf(model, pi, partial / name, dynamics=dynamics)
-            outputs |= written
-        outputs |= played
-        result = build_result(found, job.to_dict(), outputs=outputs)
+            write_urdf(model, pi, partial / urdf, dynamics=dynamics)
+        outputs |= written | played
+        result = build_result(identification, job.to_dict(), outputs=outputs)
         write_json(result, partial / "result.json")
         if job.replay:
-            _replay_of(found, job, partial).write(partial / replay)
-    others = {*names} - set(outputs.values())
-    remove_written(target / other for other in sorted(others))
-    return found, result
+            _replay_of(identification, job, partial).write(partial / replay)
+    remove_written(target / name for name in sorted({*names} - set(outputs.values())))
+    return identification, result
 
 
-def _replay_of(found: Identification, job: Job, folder: Path) -> "Replay":
+def _replay_of(identification: Identification, job: Job, folder: Path) -> "Replay":
     """Return the replay of a result that is written in a folder; its modules are imported here."""
     from robotid.cli.replay import read_findings, replay_files, replay_identified, stated_job
 
-    if isinstance(found, TorqueIdentification):
-        return replay_identified(found)
+    if isinstance(identification, TorqueIdentification):
+        return replay_identified(identification)
     entries = (*job.validation, *job.identification)
     if not entries:
         raise DataError(
@@ -286,36 +284,24 @@ def _job_of(identification: Identification) -> Job:
     wanted = wanted_families(asked.friction, model.joints)
     is_auto = all(names is None for names in wanted.values())
     drives: dict[str, tuple[str | DriveTerm, ...]] = {}
-    for drive in model.layout.drives:
-        name, own = drive.name, model.layout.own.get(drive.name, ())
-        found = chosen.get(name)
-        stated = [term for term in own if found is None or term not in found.terms]
-        families = (wanted.get(name) or ()) if found is None else found.families
+    for name in (drive.name for drive in model.layout.drives):
+        choice, terms = chosen.get(name), model.layout.own.get(name, ())
+        stated = [term for term in terms if choice is None or term not in choice.terms]
+        families = (wanted.get(name) or ()) if choice is None else choice.families
         entries: tuple[str | DriveTerm, ...] = (*(() if is_auto else families), *stated)
         if entries:
             drives[name] = entries
     options = model.options
     return Job(
-        urdf=Path(model.tree.path),
-        joints=model.joints,
-        locked=options["locked"],
-        gravity=tuple(options["gravity"]),
-        mimic=model.mimic,
-        snap_angles=read_tree(model.tree.path).joints != model.tree.joints,
-        signals=asked.signals,
-        terms=(*model.layout.terms, *([AUTO] if is_auto else [])),
-        model_dynamics=model.dynamics,
-        drives=drives,
-        couplings=model.layout.couplings,
-        contacts=model.contacts,
-        loops=model.loops,
-        passive=model.passive,
-        estimator=identification.estimator,
+        urdf=Path(model.tree.path), joints=model.joints, locked=options["locked"],
+        gravity=tuple(options["gravity"]), mimic=model.mimic,
+        snap_angles=read_tree(model.tree.path).joints != model.tree.joints, signals=asked.signals,
+        terms=(*model.layout.terms, *([AUTO] if is_auto else [])), model_dynamics=model.dynamics,
+        drives=drives, couplings=model.layout.couplings, contacts=model.contacts,
+        loops=model.loops, passive=model.passive, estimator=identification.estimator,
         identification=_entries(identification.fitted),
-        validation=_entries(identification.validation),
-        ignore=asked.ignore,
-        controller=loop,
-    )
+        validation=_entries(identification.validation), ignore=asked.ignore, controller=loop,
+    )  # fmt: skip
 
 
 def _entries(evaluations: Sequence[Evaluated]) -> tuple[LogEntry, ...]:
@@ -326,11 +312,7 @@ def _entries(evaluations: Sequence[Evaluated]) -> tuple[LogEntry, ...]:
 
 
 def identify_job(
-    job: Job,
-    model: RobotModel,
-    plan: WorkPlan,
-    *,
-    refuse: Callable[[LogEntry, DataError], None] | None = None,
+    job: Job, model: RobotModel, plan: WorkPlan, *, refuse: Refuse | None = None
 ) -> Identification:
     """Identify from a job's logs; nothing is written."""
     check_ignored(job.ignore)
@@ -345,7 +327,7 @@ def identify_job(
     report_stage(plan.progress, "checking logs")
     job, model, fitted, validation, notes = locked_as_logged(job, model, fitted, validation)
     locked = locked_findings(model, job.placed(model))
-    found = [*locked, *examine_logs(job, model, fitted, validation)]
+    findings = [*locked, *examine_logs(job, model, fitted, validation)]
     recordings = Recordings(model, structural_mapping(model), fitted, validation)
     if not recordings.is_in_memory:
         recordings = replace(recordings, plan=plan)
@@ -357,13 +339,9 @@ def identify_job(
         )
     with plan:
         concluded = conclude(
-            recordings,
-            job.estimator,
-            found,
-            job.ignore,
-            friction=job.friction,
+            recordings, job.estimator, findings, job.ignore, friction=job.friction,
             progress=plan.progress,
-        )
+        )  # fmt: skip
     return replace(
         concluded,
         stated=replace(concluded.stated, job=job),
@@ -389,16 +367,16 @@ def _identify_loops(
 
     assert isinstance(job.estimator, SimulationSettings)
     logs, validation = (
-        [job.read(entry, model, needs=needed_of(job)) for entry in entries]
+        [job.read(entry, model, needs=needed_of(job.controller)) for entry in entries]
         for entries in (job.identification, job.validation)
     )
-    found = identify_loops(
+    identification = identify_loops(
         model, logs, validation, job.controller, job.estimator, signals=job.signals,
         chooses=AUTO in job.terms, examined=diagnose(model, logs, validation, job.signals),
         ignore=job.ignore, units=units_of_logs(job.identification),
         progress=progress or ignore_progress,
     )  # fmt: skip
-    return replace(found, stated=replace(found.stated, job=job))
+    return replace(identification, stated=replace(identification.stated, job=job))
 
 
 MAIN_FLAGS = (
@@ -412,15 +390,14 @@ EXAMPLES = (
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
-    add_job(parser, "result.json", OUTPUT)
+    add_job(parser, OUTPUT)
     add_out(parser, "robotid-out")
-    _add_work(parser)
-    add_progress(parser)
+    flags = parser.add_argument_group("long logs; these flags do not change a bit of the result")
+    add_work(flags, "as in the job file, or one per core for long logs")
+    add_shown(parser, "verbose", "progress", json="print result.json")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the command."""
     with progress_of(options) as progress:
         report_stage(progress, "reading logs")  # before what takes the first second: its modules
 
@@ -428,15 +405,11 @@ def run(options: argparse.Namespace) -> int:
         workers = job.workers if options.workers is None else options.workers
         plan = WorkPlan(workers, options.scheduler, progress=progress)
         source = source_words(options.words)
-        found, result = run_job(job, options.out, plan=plan, source=source)
-    show_found(
-        result,
-        options,
-        partial(show_result, findings=found.findings, is_verbose=options.verbose),
-        [*result["outputs"].values(), "result.json"],
-    )
+        identification, result = run_job(job, options.out, plan=plan, source=source)
+    show = partial(show_result, findings=identification.findings, is_verbose=options.verbose)
+    show_found(result, options, show, [*result["outputs"].values(), "result.json"])
     if not options.json:
-        print_steps(next_steps(found, Origin(source, options.out)))
+        print_steps(next_steps(identification, Origin(source, options.out)))
     return 1 if result["verdict"]["log_errors"] else 0
 
 
@@ -490,23 +463,17 @@ def _drive_lines(result: Mapping[str, Any]) -> list[str]:
     if "simulation" not in result:
         lines = friction_lines(result["friction"]) + left_out_lines(result.get("left_out", ()))
         return lines + variation_lines(result.get("variation"))
-    rows = [
-        (
-            entry["name"],
-            f"{entry['value']:.4g}",
-            "at bound" if entry["source"] == "bound" else f"{entry['std_error']:.2g}",
-            entry["unit"],
-        )
-        for entry in result["drive_parameters"]
-        if entry["std_error"] is not None
-    ]
-    found = columns(("parameter", "value", "+-", "unit"), rows)
-    return found + variation_lines(result.get("variation"))
+    rows = []
+    for entry in result["drive_parameters"]:
+        if (error := entry["std_error"]) is not None:
+            half = "at bound" if entry["source"] == "bound" else f"{error:.2g}"
+            rows.append((entry["name"], f"{entry['value']:.4g}", half, entry["unit"]))
+    lines = columns(("parameter", "value", "+-", "unit"), rows)
+    return lines + variation_lines(result.get("variation"))
 
 
 def _worst(result: Mapping[str, Any]) -> str:
     """Return the joint with the largest prediction error, and that error."""
-    is_motion = "simulation" in result
     errors = [
         (m["relative_error_pct"], joint)
         for metrics in result["validation"] or [result["identification"]]
@@ -516,13 +483,5 @@ def _worst(result: Mapping[str, Any]) -> str:
     if not errors:
         return ""
     error, joint = max(errors)
-    return f"{joint}, {'position' if is_motion else 'torque'} error {error:.1f} %"
-
-
-def _add_work(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the reduction of long logs; they never change a result."""
-    flags = parser.add_argument_group("long logs; these flags do not change a bit of the result")
-    words = "worker processes; default: as in the job file, or one per core for long logs"
-    flags.add_argument("--workers", type=int, metavar="N", help=words)
-    words = "address of a Dask cluster, as tcp://host:8786"
-    flags.add_argument("--scheduler", metavar="ADDRESS", help=words)
+    kind = "position" if "simulation" in result else "torque"
+    return f"{joint}, {kind} error {error:.1f} %"

@@ -9,22 +9,19 @@ from typing import Any
 from robotid.base.exceptions import ModelError
 from robotid.base.findings import Finding, listed
 from robotid.cli.console import echo, print_causes, show_found
-from robotid.cli.flags import add_json, add_verbose
+from robotid.cli.job import add_shown
 from robotid.diagnosis.urdf.inspection import inspect_urdf
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add = parser.add_argument
     add("urdf", metavar="URDF")
     add("--free-flyer", action="store_true", help="floating base")
     add("--base", action="store_true", help="print the base parameters, too")
-    add_json(parser)
-    add_verbose(parser, "print notes, too")
+    add_shown(parser, "json", verbose="print notes, too")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     inspection = inspect_urdf(options.urdf, free_flyer=options.free_flyer)
     content = inspection.to_dict()
     if not (content["robot"] or options.json):

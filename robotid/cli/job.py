@@ -1,23 +1,39 @@
-"""The job: robot, logs and settings, read from TOML; every key is checked."""
+"""The job: robot, logs and settings, from TOML or from flags; every key is checked."""
 
+import argparse
 import os
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.files import check_path, missing_file
 from robotid.base.findings import listed
-from robotid.base.settings import Entries, Key, Range, Settings, check_keys, require_kind, setting
+from robotid.base.settings import (
+    Entries,
+    Key,
+    Range,
+    Settings,
+    check_keys,
+    require_kind,
+    setting,
+    table_in,
+)
 from robotid.data.files.columns import Needs
 from robotid.data.files.read import LogLayout, lay_out, read_log
 from robotid.data.files.table import Table
 from robotid.data.log import Log
-from robotid.data.signal_settings import BaseSource, LogSource, LogUnits, SignalSettings
-from robotid.data.transmission import Transmission, check_transmissions
+from robotid.data.signal_settings import (
+    BaseSource,
+    LogSource,
+    LogUnits,
+    SignalSettings,
+    Transmission,
+    check_transmissions,
+)
 from robotid.dynamics.constraint_rows import logged_base
 from robotid.estimation.fitting.estimator_settings import (
     ESTIMATORS,
@@ -40,7 +56,6 @@ _MODEL_KEYS: Mapping[str, tuple[type, ...]] = {
     for name, term in TERMS.items()
 }
 _PLAIN = tuple(name for name, term in TERMS.items() if term.is_friction)
-_LONGEST_PATH = 4096  # characters
 _FILE: Mapping[str, Any] = {"reads": (str,), "load": Path, "dump": lambda path: str(path.resolve())}
 
 
@@ -89,11 +104,6 @@ def _dump_drives(drives: Mapping[str, Sequence[str | DriveTerm]]) -> dict[str, l
         joint: [e if isinstance(e, str) else e.to_dict() for e in entries]
         for joint, entries in drives.items()
     }
-
-
-def _motors(gear: Transmission) -> list[Coupling]:
-    """Return the drives of a transmission's motors that move several joints."""
-    return [Coupling(joint, ratios, replaces=True) for joint, ratios in gear.shared.items()]
 
 
 @dataclass(frozen=True)
@@ -151,13 +161,9 @@ class Job(Settings):
     )
     signals: SignalSettings = setting(SignalSettings(), "signal processing of the logs")
     terms: tuple[str, ...] = setting(
-        (*DRIVE_TERMS, AUTO),
-        "drive terms to identify",
-        at="model",
-        reads=_MODEL_KEYS,
-        load=_load_terms,
-        dump=_dump_terms,
-    )
+        (*DRIVE_TERMS, AUTO), "drive terms to identify", at="model", reads=_MODEL_KEYS,
+        load=_load_terms, dump=_dump_terms,
+    )  # fmt: skip
     model_dynamics: str = setting(
         "full",
         "full; or static, for logs of poses and slow sweeps: velocities determine only the sign of "
@@ -266,26 +272,24 @@ class Job(Settings):
         from robotid.robot.model import RobotModel
         from robotid.robot.prior import with_assumed_inertials
 
-        gears = [gear for gear in self.transmissions if gear.matrix != "urdf"]
-        motors = [motor for gear in gears for motor in _motors(gear)]
+        motors = [  # that move several joints
+            Coupling(joint, ratios, replaces=True)
+            for gear in self.transmissions
+            if gear.matrix != "urdf"
+            for joint, ratios in gear.shared.items()
+        ]
+        own_terms = {
+            joint: [entry for entry in entries if isinstance(entry, DriveTerm)]
+            for joint, entries in self.drives.items()
+        }
         model = RobotModel.from_urdf(
-            self.urdf,
-            joints=self.joints,
-            locked=self.locked,
-            free_flyer=self.free_flyer,
-            mimic=self.mimic,
-            gravity=self.gravity,
+            self.urdf, joints=self.joints, locked=self.locked, free_flyer=self.free_flyer,
+            mimic=self.mimic, gravity=self.gravity, own_terms=own_terms,
             terms=[term for term in self.terms if term in TERMS],
-            couplings=(*self.couplings, *motors),
-            own_terms={
-                joint: [entry for entry in entries if isinstance(entry, DriveTerm)]
-                for joint, entries in self.drives.items()
-            },
-            dynamics=self.model_dynamics,
-            snap_angles=self.snap_angles,
-            constraints=(*self.contacts, *self.loops),
+            couplings=(*self.couplings, *motors), dynamics=self.model_dynamics,
+            snap_angles=self.snap_angles, constraints=(*self.contacts, *self.loops),
             passive=self.passive,
-        )
+        )  # fmt: skip
         return with_assumed_inertials(model)
 
     def placed(self, model: "RobotModel") -> tuple[str, ...]:
@@ -318,17 +322,12 @@ class Job(Settings):
 
     def _reading(self, model: "RobotModel") -> dict[str, Any]:
         return {
-            "joints": model.joints,
-            "gains": self.gains,
-            "columns": self.columns,
-            "units": self.units,
-            "prismatic": tuple(model.layout.prismatic),
-            "source": self.source,
-            "base": logged_base(model, self.base),
-            "passive": model.passive,
+            "joints": model.joints, "gains": self.gains, "columns": self.columns,
+            "units": self.units, "prismatic": tuple(model.layout.prismatic), "source": self.source,
+            "base": logged_base(model, self.base), "passive": model.passive,
             "robot": model.tree.movable,
             "transmissions": [gear.stated(model.tree.reductions) for gear in self.transmissions],
-        }
+        }  # fmt: skip
 
 
 def read_job(path: str | Path) -> Job:
@@ -376,15 +375,14 @@ def job_from_settings(
     check_keys(table, Job.schema(), where)
     if "urdf" not in table:
         raise SettingsError(f"{where} has no key 'urdf'; name the robot's URDF file")
-    found = dict(table, urdf=stated_path(table["urdf"], where, folder, expand=expand))
+    whole = dict(table, urdf=stated_path(table["urdf"], where, folder, expand=expand))
     for key in ("identification", "validation", "payload_check"):
-        entries = table.get(key, [])
-        found[key] = [
+        whole[key] = [
             dict(entry, log=stated_path(entry["log"], where, folder, expand=expand))
-            for entry in entries
+            for entry in table.get(key, [])
         ]
     try:
-        return Job.from_dict(found)
+        return Job.from_dict(whole)
     except SettingsError as error:
         raise SettingsError(f"{where}: {error}") from error
 
@@ -397,13 +395,286 @@ def written_job(settings: Mapping[str, Any], where: str) -> Job:
 
 def stated_path(text: str, where: str, folder: Path, *, expand: bool) -> Path:
     """Return a path relative to a folder."""
-    is_unicode = not any("\ud800" <= character <= "\udfff" for character in text)
-    if "\0" in text or len(text) > _LONGEST_PATH or not is_unicode:
-        raise SettingsError(
-            f"{where}: {text[:80]!r} is not a valid path, wanted UTF-8 without NUL, at most "
-            f"{_LONGEST_PATH} characters"
-        )
+    try:
+        check_path(text)
+    except SettingsError as error:
+        raise SettingsError(f"{where}: {error}") from error
     expanded = os.path.expandvars(text) if expand else text
     if expand and "$" in expanded:
         raise SettingsError(f"{where}: path {text!r} names an environment variable that is not set")
     return folder / expanded
+
+
+def number(word: str, flag: str, wanted: str = "a number", shown: str = "") -> float:
+    """Return the number of a word."""
+    try:
+        return float(word)
+    except ValueError as error:
+        raise SettingsError(f"{flag} {shown or repr(word)}: wanted {wanted}") from error
+
+
+def pairs(words: Sequence[str], flag: str) -> dict[str, float]:
+    """Return numbers by joint."""
+    return {
+        name: number(text, flag, "JOINT=NUMBER", repr(f"{name}={text}" if text else name))
+        for name, text in _once(words, flag).items()
+    }
+
+
+def _once(words: Sequence[str], flag: str) -> dict[str, str]:
+    """Return the texts of words like JOINT=TEXT by joint; refuse two of one joint."""
+    texts: dict[str, str] = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        if texts.setdefault(name, value) != value:
+            raise SettingsError(
+                f"{flag} states {name} twice, as {texts[name]} and as {value}; state it once"
+            )
+    return texts
+
+
+def _names(words: Sequence[str], flag: str) -> dict[str, str]:
+    if wrong := [word for word in words if not all(word.partition("=")[::2])]:
+        raise SettingsError(f"{flag} {wrong[0]!r}: wanted JOINT=NAME")
+    return _once(words, flag)
+
+
+def _of_all_or_pairs(words: Sequence[str], flag: str) -> float | dict[str, float]:
+    """Return one number for all joints, or numbers by joint."""
+    if len(words) > 1 or "=" in words[0]:
+        return pairs(words, flag)
+    return number(words[0], flag, "NUMBER or JOINT=NUMBER")
+
+
+def _payload_check(word: str, flag: str) -> list[dict[str, Any]]:
+    """Return the log with a payload, and its known mass [kg]."""
+    log, _, mass = word.rpartition("=")
+    return [{"log": log, "mass": number(mass, flag, "LOG=KG", repr(word))}]
+
+
+@dataclass(frozen=True)
+class Flags:
+    """Flags that state settings; types, help and defaults come from the fields of the settings."""
+
+    defaults: Settings
+    # for each flag the key of the job file and the placeholder of its value in the help, empty for
+    # a list of permitted words; of a switch, the help where it differs from that of the key
+    keys: Mapping[str, tuple[str, str]]
+    # the conversion of words whose type does not determine it
+    read: Mapping[str, Callable[[Any, str], Any]] = field(default_factory=dict)
+
+    def add(self, parser: "argparse._ActionsContainer", wanted: Sequence[str] = ()) -> None:
+        """Add flags."""
+        settings = self.defaults
+        schema, about, values = settings.schema(), settings.paths(), settings.to_dict()
+        for flag in wanted or self.keys:
+            at, shown = self.keys[flag]
+            kinds, key, value = _in(schema, at), about[at], _in(values, at)
+            words, about_flag = key.words, dict[str, Any](metavar=shown)
+            if kinds == (bool,):
+                words = shown or words
+                about_flag = {"action": "store_const", "const": not flag.startswith("--no-")}
+            elif not shown:
+                words, about_flag = key.text, {"choices": key.among}
+            elif _is_repeated(kinds):
+                words += "; repeatable"
+                about_flag["action"] = "append"
+            elif flag not in self.read and bool not in kinds:
+                about_flag["type"] = float if float in kinds else kinds[0]
+            if type(value) in (int, float) and 0 < value < float("inf"):
+                words += f"; default: {value:g}"
+            parser.add_argument(flag, help=words.replace("%", "%%"), **about_flag)
+
+    def given(self, options: argparse.Namespace) -> list[str]:
+        """Return the flags that are given."""
+        return [flag for flag in self.keys if getattr(options, _name(flag), None) is not None]
+
+    def stated(self, options: argparse.Namespace, wanted: Sequence[str] = ()) -> dict[str, Any]:
+        """Return the settings that flags state, as a table of a job file."""
+        schema, table = self.defaults.schema(), dict[str, Any]()
+        for flag in self.given(options):
+            if wanted and flag not in wanted:
+                continue
+            at, value = self.keys[flag][0], getattr(options, _name(flag))
+            *tables, key = at.split(".")
+            read = self.read.get(flag) or _reader(_in(schema, at))
+            table_in(table, tables)[key] = read(value, flag)
+        return table
+
+
+def _in(table: Any, at: str) -> Any:  # noqa: ANN401
+    """Return the entry of nested tables at a dotted key, None if there is none."""
+    for name in at.split("."):
+        table = table.get(name) if isinstance(table, Mapping) else None
+    return table
+
+
+def _is_repeated(kinds: Any) -> bool:  # noqa: ANN401
+    """Return whether a setting has several entries, so that its flag may be repeated."""
+    return kinds.count is None if isinstance(kinds, Entries) else dict in kinds
+
+
+def _reader(kinds: Any) -> Callable[[Any, str], Any]:  # noqa: ANN401
+    """Return the conversion from words to a setting of given types, as of ``Settings.schema``."""
+    if isinstance(kinds, Entries):
+        return pairs if kinds.outer is dict else _listed
+    if dict in kinds:
+        return _of_all_or_pairs
+    if {bool, float} <= {*kinds}:
+        return lambda word, flag: word != "false" and number(word, flag, "a number or false")
+    return lambda value, _: value
+
+
+def _listed(words: Sequence[str], _: str) -> list[str]:
+    return [name for word in words for name in word.split(",")]
+
+
+#: Flags of the keys of a job file.
+JOB = Flags(
+    Job(Path()),
+    {
+        "--estimator": ("estimator.name", "NAME"),
+        "--kp": ("controller.kp", "[JOINT=]N_M_PER_RAD"),
+        "--kd": ("controller.kd", "[JOINT=]N_M_S_PER_RAD"),
+        "--payload-check": ("payload_check", "LOG=KG"),
+        "--joints": ("joints", "A,B,..."),
+        "--lock": ("locked", "JOINT=POSITION"),
+        "--snap-angles": ("snap_angles", ""),
+        "--gain": ("torque.gains", "JOINT=N_M_PER_A"),
+        "--rate": ("signals.rate", "HZ"),
+        "--cutoff": ("signals.cutoff", "HZ"),
+        "--velocity": ("signals.velocity", "HOW"),
+        "--acceleration": ("signals.acceleration", "HOW"),
+        "--order": ("signals.order", "N"),
+        "--trim": ("signals.trim", "S"),
+        "--min-velocity": ("signals.min_velocity", "RAD_PER_S"),
+        "--friction-band": ("signals.friction_band", "RAD_PER_S"),
+        "--max-gap": ("signals.max_gap", "S"),
+        "--torque-delay": ("signals.torque_delay", "S"),
+        "--velocity-delay": ("signals.velocity_delay", "S"),
+        "--friction": ("model.friction", "MODEL"),
+        "--dynamics": ("output.dynamics", ""),
+        "--no-report": ("output.report", "write no report.html"),
+        "--replay": ("output.replay", "also write replay.html: the first validation log"),
+        "--ignore": ("doctor.ignore", "CODE"),
+        "--time-unit": ("units.time", "UNIT"),
+        "--angle-unit": ("units.angle", "UNIT"),
+        "--topic": ("log.topic", "NAME"),
+        "--command-topic": ("log.command", "NAME"),
+        "--rename": ("log.joints", "JOINT=NAME"),
+        "--effort": ("log.effort", "MEANING"),
+        "--stamp": ("log.stamp", "CLOCK"),
+    },
+    {"--rename": _names, "--payload-check": _payload_check},
+)
+#: Flags of the estimator.
+FIT = ("--estimator", "--kp", "--kd", "--payload-check")
+#: Flags of the robot and of the reading of its logs.
+LOG = tuple(
+    flag for flag, (key, _) in JOB.keys.items() if flag not in FIT and not key.startswith("output.")
+)
+#: Flags of the files that "identify" writes.
+OUTPUT = ("--dynamics", "--no-report", "--replay")
+#: Flags of a tracked or replayed log.
+ONLINE = tuple(
+    flag
+    for flag, (key, _) in JOB.keys.items()
+    if flag in ("--rate", "--cutoff", "--min-velocity")
+    or (flag in LOG and not key.startswith(("signals.", "doctor.")))
+)
+#: Flags of a bag or of foreign tables.
+SOURCE = ("--topic", "--command-topic", "--effort", "--stamp")
+#: Flags of the robot and of the units of a table.
+ROBOT = ("--joints", "--lock", "--snap-angles", "--time-unit", "--angle-unit")
+#: Flags of a motion without torques.
+MOTION = tuple(
+    flag
+    for flag, (key, _) in JOB.keys.items()
+    if flag in LOG and not key.startswith(("torque.", "doctor."))
+    if flag not in ("--effort", "--torque-delay")
+)
+_SHOWN = {
+    "json": "print one JSON object",
+    "verbose": "print notes, too; print stages and choices with their reasons on stderr",
+    "progress": "show progress on stderr even if it is no terminal, or with --json",
+}
+
+
+def add_shown(parser: argparse.ArgumentParser, *names: str, **words: str) -> None:
+    """Add switches of what is shown, with words where they differ from the usual ones."""
+    for name in (*names, *words):
+        parser.add_argument(f"--{name}", action="store_true", help=words.get(name, _SHOWN[name]))
+
+
+def add_out(parser: argparse.ArgumentParser, folder: str) -> None:
+    """Add the folder to write to."""
+    words = f"folder to write to; default: {folder}"
+    parser.add_argument("--out", default=folder, metavar="DIR", help=words)
+
+
+def add_work(parser: "argparse._ActionsContainer", default: str) -> None:
+    """Add the flags of worker processes and clusters."""
+    words = f"worker processes; default: {default}"
+    parser.add_argument("--workers", type=int, metavar="N", help=words)
+    words = "address of a Dask cluster, as tcp://host:8786"
+    parser.add_argument("--scheduler", metavar="ADDRESS", help=words)
+
+
+def add_job(parser: argparse.ArgumentParser, output: Sequence[str] = ()) -> None:
+    """Add a job file, or the flags in place of one."""
+    parser.add_argument("source", metavar="JOB.toml | URDF")
+    parser.add_argument("logs", nargs="*", metavar="LOG", help="logs to fit")
+    flags = parser.add_argument_group("instead of a job file, with URDF LOG [LOG ...]")
+    words = "validation logs; repeatable"
+    flags.add_argument("--validate", nargs="+", action="extend", metavar="LOG", help=words)
+    JOB.add(flags, (*FIT, *LOG, *output))
+
+
+def job_from_flags(options: argparse.Namespace) -> Job:
+    """Return the job that a command line names or states."""
+    logs = getattr(options, "logs", ())  # a command that designs a motion needs none
+    if Path(options.source).suffix == ".toml":
+        if given := [*logs, *_given(options)]:
+            raise SettingsError(
+                f"{options.source} is a job file; it states the logs and settings. Remove "
+                f"{listed(given)}, and state them in the job file"
+            )
+        return read_job(options.source)
+    if logs == []:
+        kind = "motion" if hasattr(options, "given") else "log"  # of preview
+        one = kind.upper()
+        raise SettingsError(f"no {kind} is given; wanted URDF {one} [{one} ...], or JOB.toml")
+    validation = getattr(options, "validate", None) or ()
+    table = {
+        "urdf": options.source,
+        "identification": [{"log": log} for log in logs],
+        "validation": [{"log": log} for log in validation],
+        **JOB.stated(options),
+    }
+    return job_from_settings(table, "command line", Path())
+
+
+def source_words(words: Sequence[str]) -> tuple[str, ...]:
+    """Return the words of a command line that determine the identification."""
+    _, *rest = words
+    source, shown = list[str](), ("--json", "--progress", "--verbose")
+    for before, word in zip(words, rest, strict=False):
+        if before != "--out" and word not in (*shown, "--out") and not word.startswith("--out="):
+            source.append(word)
+    return tuple(source)
+
+
+def refuse_log_flags(options: argparse.Namespace, why: str) -> None:
+    """Refuse the flags of the reading of logs."""
+    if given := _given(options):
+        raise SettingsError(f"{why}; remove {listed(given)}")
+
+
+def _given(options: argparse.Namespace) -> list[str]:
+    validate = ["--validate"] if getattr(options, "validate", None) is not None else []
+    return validate + JOB.given(options)
+
+
+def _name(flag: str) -> str:
+    """Return the name of a flag in argparse."""
+    return flag[2:].replace("-", "_")

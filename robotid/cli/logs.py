@@ -1,11 +1,11 @@
 """The logs of a job: opened once, examined, and identified by their inputs."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from robotid.diagnosis.verdict.verdict import check_ignored
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import SurveyedLog, survey_log
+from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.output.files.result_file import Result, load_result, stated_model, stated_parameters
 from robotid.robot.model import RobotModel
 
@@ -36,17 +37,21 @@ _PIECES = 8  # pieces per rows in memory: the filter of a piece needs memory of 
 _SHORTEST = 256  # rows of a piece
 
 
+#: Called with a log that cannot be read, in place of raising the error.
+Refuse: TypeAlias = Callable[[LogEntry, DataError], None]
+
+
 def survey_logs(
     job: Job,
     model: RobotModel,
     *groups: Sequence[LogEntry],
-    refuse: Callable[[LogEntry, DataError], None] | None = None,
+    refuse: Refuse | None = None,
     needs: Needs = "torque",
 ) -> tuple[tuple[SurveyedLog, ...], ...]:
     """Return the logs of each group, ready to be read."""
     paths = dict.fromkeys(entry.path for entry in chain(*groups))
     opened = {path: _open(job, model, path, needs) for path in paths}
-    rows = sum(_count(found) for found in opened.values())
+    rows = sum(map(_count, opened.values()))
     is_long = rows > job.rows_in_memory and not model.is_static
     length = max(job.rows_in_memory // _PIECES, _SHORTEST) if is_long else None
 
@@ -55,11 +60,11 @@ def survey_logs(
         units_of_logs(entries)
         for entry in entries:
             try:
-                found = opened[entry.path]
-                if isinstance(found, DataError):
-                    raise found
+                file = opened[entry.path]
+                if isinstance(file, DataError):
+                    raise file
                 window = entry.start, entry.end
-                log = survey_log(*found, model, job.signals, window, length=length)
+                log = survey_log(*file, model, job.signals, window, length=length)
                 logs.append(replace(log, unit=entry.unit or ""))
             except DataError as error:
                 if refuse is None:
@@ -118,9 +123,9 @@ def locked_as_logged(
     """Return the job with joints locked at their positions in the logs, unless it states them."""
     logged, logs = {}, (*fitted, *validation)
     for joint in [joint for joint in model.locked if joint not in job.placed(model)]:
-        found = [log.locked[joint] for log in logs if joint in log.locked]
-        if found and np.ptp(np.concatenate(found)) <= STILL:
-            logged[joint] = float(np.median(np.concatenate(found)))
+        positions = np.concatenate([log.locked.get(joint, []) for log in logs])
+        if len(positions) and np.ptp(positions) <= STILL:
+            logged[joint] = float(np.median(positions))
     if not logged:
         return job, model, fitted, validation, ()
     shown = ", ".join(f"{joint} = {position:.4g}" for joint, position in logged.items())
@@ -153,8 +158,7 @@ def examine_logs(
 def job_of_result(job: Job, path: str | Path, advice: str) -> tuple[Job, list[LogEntry]]:
     """Return a job with the settings of a result, and the logs that the result was fitted to."""
     result = load_result(path).content
-    stated = written_job(result["settings"], Path(path).name)
-    hashes = {i["sha256"] for i in result["inputs"] if i["role"] == "identification"}
+    stated, hashes = written_job(result["settings"], Path(path).name), fitted_hashes(result)
     for entry in stated.identification:
         if not log_exists(entry.path) or file_sha256(entry.path) not in hashes:
             raise DataError(
@@ -162,6 +166,11 @@ def job_of_result(job: Job, path: str | Path, advice: str) -> tuple[Job, list[Lo
             )
     wanted = replace(stated, urdf=job.urdf, identification=job.identification)
     return wanted, list(stated.identification)
+
+
+def fitted_hashes(result: Mapping[str, Any]) -> set[str]:
+    """Return the SHA-256 of the logs that a result was fitted to."""
+    return {entry["sha256"] for entry in result["inputs"] if entry["role"] == "identification"}
 
 
 def result_run(job: Job, path: str | Path) -> tuple[Job, list[LogEntry], RobotModel, "Run"]:
@@ -188,27 +197,21 @@ def _open(
     return layout, replace(table, read=lambda wanted: read(tuple(wanted)))
 
 
-def _count(found: tuple[LogLayout, Table] | DataError) -> int:
+def _count(file: tuple[LogLayout, Table] | DataError) -> int:
     """Return the approximate number of rows of a file, 0 if it is only read whole."""
-    if isinstance(found, DataError) or found[1].rows is None:
-        return 0
-    return found[1].rows.count()
+    return 0 if isinstance(file, DataError) or file[1].rows is None else file[1].rows.count()
 
 
 def log_of_commands(job: Job, entry: LogEntry, result: Result) -> Log:
     """Return a log with the inputs of the simulated robot, gravity compensation included."""
-    log = job.read(entry, result.robot, needs=needed_of(job))
+    from robotid.identification.closed_loop.from_commands import driven_log, with_gravity
+
+    log = job.read(entry, result.robot, needs=needed_of(job.controller))
     if job.controller.kind == "torque":
-        from robotid.identification.closed_loop.from_commands import driven_log
-
         return driven_log(result.robot, log, job.signals)
-    if not job.controller.gravity_compensation:
-        return log
-    from robotid.identification.closed_loop.from_commands import with_gravity
-
-    return with_gravity(job.model(), log)
+    return with_gravity(job.model(), log) if job.controller.gravity_compensation else log
 
 
-def needed_of(job: Job) -> Needs:
+def needed_of(controller: LoopSettings) -> Needs:
     """Return the signals that a simulation requires of a log in addition to positions."""
-    return "torque" if job.controller.kind == "torque" else "commands"
+    return "torque" if controller.kind == "torque" else "commands"

@@ -4,20 +4,18 @@ import argparse
 from typing import Any
 
 from robotid.cli.console import progress_of, show_found
-from robotid.cli.flags import add_json, add_out, add_progress
+from robotid.cli.job import add_out, add_shown
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
-    add = parser.add_argument
     add_out(parser, "robotid-paper")
-    add_json(parser, "paper.json")
-    add("--quick", action="store_true", help="few iterations and motions, as a trial")
-    add_progress(parser)
+    parser.add_argument(
+        "--quick", action="store_true", help="few iterations and motions, as a trial"
+    )
+    add_shown(parser, "progress", json="print paper.json")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     from robotid.paper.run import run_paper
     from robotid.paper.study import PaperSettings
 

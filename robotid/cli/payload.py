@@ -12,8 +12,16 @@ from robotid.base.findings import listed
 from robotid.base.text import columns, in_digits_of
 from robotid.base.typing import ProgressCallback, report_stage
 from robotid.cli.console import echo, progress_of, show_found
-from robotid.cli.flags import JOB, LOG, add_json, job_from_flags, number, refuse_log_flags
-from robotid.cli.job import Job, LogEntry
+from robotid.cli.job import (
+    JOB,
+    LOG,
+    Job,
+    LogEntry,
+    add_shown,
+    job_from_flags,
+    number,
+    refuse_log_flags,
+)
 from robotid.cli.logs import job_of_result, survey_logs
 from robotid.diagnosis.verdict.scale_check import PayloadCheck
 from robotid.dynamics.base_parameters import structural_mapping
@@ -98,52 +106,43 @@ def check_payloads(
         link = entry.link or model.layout.bodies[-1]
         check = mass_checks(*runs, masses={link: entry.mass})[link]
         checks.append(replace(check, log=str(entry.path), sha256=file_sha256(entry.path)))
-    return tuple(sorted(checks, key=_width))
 
+    def width(check: PayloadCheck) -> float:  # relative, of the interval of an identified mass
+        low, high = check.interval
+        return (high - low) / check.known if check.identified is not None else float("inf")
 
-def _width(check: PayloadCheck) -> float:
-    """Return the relative width of the interval of an identified mass; inf without one."""
-    low, high = check.interval
-    return (high - low) / check.known if check.identified is not None else float("inf")
+    return tuple(sorted(checks, key=width))
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add = parser.add_argument
     add("source", metavar="URDF")
     add("logs", nargs="+", metavar="LOG", help="logs with the payload")
     words = "log without the payload, or a result.json or its folder; repeatable"
-    again: dict[str, Any] = {"action": "append", "default": []}
     add("--reference", required=True, metavar="LOG | RESULT", help=words, action="append")
     words = "link that carries the payload; default: the last moving link; repeatable"
-    add("--link", metavar="NAME", help=words, **again)
+    add("--link", metavar="NAME", help=words, action="append", default=[])
     words = "mass of the payload, if it is known; for several payloads LINK=KG"
-    add("--mass", metavar="KG", help=words, **again)
+    add("--mass", metavar="KG", help=words, action="append", default=[])
     words = "from a known mass, estimate the gains of logged currents without --gain"
     add("--gains", action="store_true", help=words)
-    add_json(parser)
+    add_shown(parser, "json")
     flags = [flag for flag in LOG if flag != "--ignore"]  # the logs are not examined
     JOB.add(parser.add_argument_group("the logs, unless a RESULT is given"), flags)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     if any(map(is_result, options.reference)):
         refuse_log_flags(options, "a RESULT states how its logs are read")
     with progress_of(options) as progress:
-        found = measure_payload(
-            job_from_flags(options),
-            options.reference,
-            links=options.link,
-            masses=options.mass,
-            find_gains=options.gains,
-            progress=progress,
-        )
-    show_found(found, options, _show)
+        content = measure_payload(
+            job_from_flags(options), options.reference, links=options.link, masses=options.mass,
+            find_gains=options.gains, progress=progress,
+        )  # fmt: skip
+    show_found(content, options, _show)
 
 
 def _show(content: dict[str, Any]) -> None:
-
     checks = {check["link"]: check for check in content.get("mass_checks", ())}
     for found in content["payloads"]:
         _print_one_payload(found, checks.get(found["link"]))
@@ -176,35 +175,30 @@ def _print_one_payload(found: Mapping[str, Any], check: Mapping[str, Any] | None
         )
     if found["com"] is not None:
         print(f"  centre of mass in the frame of {link} [m]")
-        rows = [
-            [axis, *_with_error(x, error)]
-            for axis, x, error in zip("xyz", found["com"], found["com_std_error"], strict=True)
-        ]
-        _print_values(rows)
+        _print_values("xyz", found["com"], found["com_std_error"])
     if found["inertia"] is not None:
-        for where, key in (
-            ("its centre of mass", "inertia"),
-            (f"the origin of {link}", "inertia_at_link"),
+        for where, key, errors in (
+            ("its centre of mass", "inertia", found["inertia_std_error"]),
+            (f"the origin of {link}", "inertia_at_link", [[None] * 3] * 3),
         ):
             echo(f"  inertia about {where}, axes of {link} [kg m^2]", "  ")
-            errors = found["inertia_std_error"] if key == "inertia" else None
-            rows = [
-                [f"I{'xyz'[i]}{'xyz'[j]}", *_with_error(found[key][i][j], errors and errors[i][j])]
-                for i in range(3)
-                for j in range(i, 3)
-            ]
-            _print_values(rows)
+            upper = [(i, j) for i in range(3) for j in range(i, 3)]
+            _print_values(
+                [f"I{'xyz'[i]}{'xyz'[j]}" for i, j in upper],
+                [found[key][i][j] for i, j in upper],
+                [errors[i][j] for i, j in upper],
+            )
     for name, reason in found["reasons"].items():
         what = "centre of mass" if name == "com" else name
         echo(f"  {what}: not determined; {reason}", "  ")
 
 
-def _with_error(value: float, error: float | None) -> list[str]:
-    """Return a value in the digits of its error, and the error, as cells."""
-    shown, half = in_digits_of(value, error)
-    return [shown, "" if half == "-" else f"+- {half}"]
-
-
-def _print_values(rows: Sequence[Sequence[str]]) -> None:
-    for line in columns([""] * len(rows[0]), rows, left=(0, 2))[1:]:
-        print(f"  {line}")
+def _print_values(
+    names: Sequence[str], values: Sequence[float], errors: Sequence[float | None]
+) -> None:
+    """Print values in the digits of their errors, a row for each."""
+    rows = []
+    for name, value, error in zip(names, values, errors, strict=True):
+        shown, half = in_digits_of(value, error)
+        rows.append([name, shown, "" if half == "-" else f"+- {half}"])
+    print("\n".join(f"  {line}" for line in columns(["", "", ""], rows, left=(0, 2))[1:]))

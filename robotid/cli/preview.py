@@ -14,9 +14,17 @@ from robotid.base.files import file_sha256
 from robotid.base.findings import listed
 from robotid.base.text import columns
 from robotid.cli.console import echo, recordings_of, show_found
-from robotid.cli.flags import JOB, MOTION, add_json, job_from_flags, pairs, refuse_log_flags
-from robotid.cli.job import Job, LogEntry
-from robotid.cli.logs import result_run
+from robotid.cli.job import (
+    JOB,
+    MOTION,
+    Job,
+    LogEntry,
+    add_shown,
+    job_from_flags,
+    pairs,
+    refuse_log_flags,
+)
+from robotid.cli.logs import fitted_hashes, result_run
 from robotid.design.previews import preview_logs
 from robotid.estimation.fitting.survey import SurveyedLog, survey_log
 from robotid.output.files.entries import build_preview
@@ -41,7 +49,7 @@ def preview_job(
         return build_preview(preview_logs(model, motions, job.estimator, **stated))
     job, fitted, model, run = result_run(job, given)
     result = load_result(given).content
-    hashes = {entry["sha256"] for entry in result["inputs"] if entry["role"] == "identification"}
+    hashes = fitted_hashes(result)
     is_fitted = {entry.path: file_sha256(entry.path) in hashes for entry in job.identification}
     if not any(is_fitted.values()):
         motions = _motions(job, model, job.identification)
@@ -89,7 +97,6 @@ _TERM = re.compile(r" [+-] ")  # the sign before each further term of an express
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add = parser.add_argument
     add("source", metavar="JOB.toml | URDF")
     add("logs", nargs="*", metavar="MOTION", help="motions or logs; only positions are read")
@@ -100,28 +107,20 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("--noise", metavar="JOINT=N_M", action="append", default=[], help=words)
     words = "correlation time of the noise [s]; 0: uncorrelated samples; default: 0.1"
     add("--correlation", metavar="S", type=float, help=words)
-    add_json(parser)
     words = "print standard parameters and whole expressions, too; print choices on stderr"
-    parser.add_argument("--verbose", action="store_true", help=words)
+    add_shown(parser, "json", verbose=words)
     flags = parser.add_argument_group("instead of a job file or a RESULT, with URDF MOTION")
     JOB.add(flags, ("--estimator", *MOTION))
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     if options.given:
         refuse_log_flags(options, "a RESULT states how its logs are read")
-    stated = {"noise": stated_noise(options), "correlation": options.correlation}
-    show_found(
-        preview_job(job_from_flags(options), options.given, **stated),
-        options,
-        partial(_show, is_verbose=options.verbose),
+    noise = pairs(options.noise, "--noise")
+    content = preview_job(
+        job_from_flags(options), options.given, noise=noise, correlation=options.correlation
     )
-
-
-def stated_noise(options: argparse.Namespace) -> dict[str, float]:
-    """Return the noise that the flags state, by joint [N m or N]."""
-    return pairs(options.noise, "--noise")
+    show_found(content, options, partial(_show, is_verbose=options.verbose))
 
 
 def _show(content: dict[str, Any], *, is_verbose: bool) -> None:

@@ -3,7 +3,7 @@
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,22 +13,24 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import check_file, read_json
 from robotid.base.findings import listed
 from robotid.base.typing import Array
-from robotid.cli.flags import (
+from robotid.cli.job import (
     JOB,
     ONLINE,
-    add_robot_and_log,
+    Job,
+    LogEntry,
     job_from_flags,
     refuse_log_flags,
+    written_job,
 )
-from robotid.cli.job import Job, LogEntry, written_job
 from robotid.cli.logs import log_of_commands
-from robotid.data.files.formats import open_table
+from robotid.data.base_motion import BaseMotion
+from robotid.data.files.read import open_table
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource
 from robotid.design.clearance import Clearance
 from robotid.design.limits import LIMITS, Course, MotionLimits
-from robotid.dynamics.completed_logs import closed_log
 from robotid.dynamics.prediction import predict, predict_instants
+from robotid.dynamics.prepared_logs import closed_log
 from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.result import TorqueIdentification
 from robotid.output.files.result_file import (
@@ -44,20 +46,16 @@ from robotid.robot.model import RobotModel
 
 #: Columns of the pose of a floating base in the world: position [m] and quaternion.
 _BASE = ("base_x", "base_y", "base_z", "base_qx", "base_qy", "base_qz", "base_qw")
-
-#: Label of the torque of the URDF's bodies with identified drives.
 _PROJECTED = "Torques: the part that contact forces cannot cause."
+#: Label of the torque of the URDF's bodies with identified drives.
 _DRIVEN = "URDF + drives"
-
-#: The entries of a track.json that are read.
 
 
 @dataclass(frozen=True)
 class Findings:
     """Results of identifications and of a tracker, as read from their files."""
 
-    results: Mapping[str, Mapping[str, Any]]  # contents of result.json, by label
-    commanded: Mapping[str, Result] = field(default_factory=dict)  # results with gains of drives
+    results: Mapping[str, Result]  # by label
     track: Mapping[str, Any] | None = None  # content of a track.json
     folder: Path = Path()  # of the track.json and its history
     beside: Path = Path()  # folder of the first file
@@ -65,14 +63,13 @@ class Findings:
     @property
     def settings(self) -> Mapping[str, Any] | None:
         """The settings of the first of them, None if there is none."""
-        found = [content for content in (*self.results.values(), self.track) if content]
-        return dict(found[0]["settings"]) if found else None
+        contents = [*(result.content for result in self.results.values()), self.track]
+        return next((content["settings"] for content in contents if content), None)
 
 
 def read_findings(paths: Sequence[str | Path]) -> Findings:
     """Read results to show; the label of a result is the name of its folder."""
-    results: dict[str, Mapping[str, Any]] = {}
-    commanded: dict[str, Result] = {}
+    results: dict[str, Result] = {}
     tracks: list[tuple[Path, Mapping[str, Any]]] = []
     beside: list[Path] = []
     for path in map(Path, paths):
@@ -84,20 +81,18 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
                 raise DataError(f"{str(path)!r} has no result.json and no track.json")
         beside.append(files[0].parent)
         for file in files:
-            track = _track(file)
-            if track is not None:
-                tracks.append((file.parent, track))
+            content = read_json(file, "result")
+            if isinstance(content, dict) and {"history", "changes"} <= set(content):
+                check_shape(content, schema("track"), file.name)
+                tracks.append((file.parent, content))
                 continue
             name = file.resolve().parent.name if len(paths) > 1 else "identified"
             label = name if name not in results else f"{name} {len(results) + 1}"
-            loaded = load_result(file)
-            results[label] = loaded.content
-            if loaded.commanded:
-                commanded[label] = loaded
+            results[label] = load_result(file)
     if len(tracks) > 1:
         raise DataError(f"{len(tracks)} tracks are given, wanted at most one")
-    folder, content = tracks[0] if tracks else (Path(), None)
-    return Findings(results, commanded, content, folder, (beside or [Path()])[0])
+    folder, track = tracks[0] if tracks else (Path(), None)
+    return Findings(results, track, folder, (beside or [Path()])[0])
 
 
 def stated_job(findings: Findings, urdf: str | Path, log: str | Path) -> Job:
@@ -113,11 +108,11 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
     """Return the replay of a log, a page to write."""
     model = job.model()
     (entry,) = job.identification
-    if findings.commanded:
-        return _replay_commanded(job, findings.commanded, ghost)
+    if commanded := {label: x for label, x in findings.results.items() if x.commanded}:
+        return _replay_commanded(job, commanded, ghost)
     is_motion = not job.lay_out(entry, model, needs="motion")[0].has_torque
     motion = closed_log(model, job.read(entry, model, needs="motion" if is_motion else "torque"))
-    robots = {label: stated_model(r, model) for label, r in findings.results.items()}
+    robots = {label: stated_model(x.content, model) for label, x in findings.results.items()}
     bodies = {label: robot.carried_by for label, robot in robots.items()}
     ghosts = {}
     if ghost is not None:
@@ -140,21 +135,18 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
         q = np.hstack([motion.base.pose, q])
     base = None if ghosts or model.free_flyer else _base_poses(job, entry, motion)
     if base is not None:  # the same robot with the trunk as first body
-        shown, q = _floating(job, model), np.hstack([base, q])
+        shown = RobotModel.from_urdf(
+            job.urdf, joints=model.joints, locked=job.locked, free_flyer=True, mimic=job.mimic,
+            snap_angles=job.snap_angles,
+        )  # fmt: skip
+        q = np.hstack([base, q])
         trunk = shown.standard_parameters()[:10]
         masses = {label: np.r_[trunk, pi] for label, pi in masses.items()}
     return replay(
-        shown,
-        motion.t,
-        q,
-        torques=torques,
-        masses=masses or None,
-        ghosts=ghosts,
+        shown, motion.t, q, torques=torques, masses=masses or None, ghosts=ghosts,
         bands=None if findings.track is None else _bands(findings.track, findings.folder),
-        marks=marks,
-        notes=notes,
-        log=entry.path.name,
-    )
+        marks=marks, notes=notes, log=entry.path.name,
+    )  # fmt: skip
 
 
 def replay_identified(identification: TorqueIdentification) -> Replay:
@@ -169,14 +161,11 @@ def replay_identified(identification: TorqueIdentification) -> Replay:
     sigma = identification.estimate.sigma[model.n_rows - len(model.joints) :]
     torques = _of_joints(Torques(motion.t, motion.tau, predicted, sigma), model)
     return replay(
-        model,
-        motion.t,
-        motion.q,
-        torques=torques,
+        model, motion.t, motion.q, torques=torques,
         masses={"URDF": identification.prior, "identified": identification.standard},
         notes=[f"Motion: {shown.recording.name}.", *([_PROJECTED] if model.constraints else [])],
         log=Path(shown.recording.log.path).name,
-    )
+    )  # fmt: skip
 
 
 def _replay_commanded(job: Job, results: Mapping[str, Result], ghost: str | Path | None) -> Replay:
@@ -189,42 +178,21 @@ def _replay_commanded(job: Job, results: Mapping[str, Result], ghost: str | Path
     simulated = {label: result.follow_commands(log) for label, result in results.items()}
     names = ["simulated"] if len(simulated) == 1 else [f"simulated: {x}" for x in simulated]
     shown = dict(zip(names, simulated.values(), strict=True)) | {"commanded": q_ref}
-    ghosts = {label: _finite_rows(log.t, q + zero) for label, q in shown.items()}
+    known = {label: np.isfinite(q).all(axis=1) for label, q in shown.items()}
+    ghosts = {label: (log.t[rows], shown[label][rows] + zero) for label, rows in known.items()}
     if ghost is not None:
         other = job.read(LogEntry(Path(ghost)), model, needs="motion")
         ghosts[Path(ghost).name] = (other.t, other.q + zero)
     error = np.sqrt(np.mean((q_ref - log.q) ** 2, axis=0))
     left = np.sqrt(np.nanmean((shown[names[0]] - log.q) ** 2, axis=0))
     worst = [f"{model.joints[j]} {1e3 * left[j]:.2g}" for j in np.argsort(-left).tolist()]
+    notes = [
+        f"Motion: {entry.path.name}, as measured; ghosts: command and simulation.",
+        f"Simulated position error, RMS [mrad or mm]: {listed(worst, 3)}.",
+    ]
+    torques = Torques(log.t, log.q, shown, error, "position")
     return replay(
-        model,
-        log.t,
-        log.q + zero,
-        torques=Torques(log.t, log.q, shown, error, "position"),
-        ghosts=ghosts,
-        notes=[
-            f"Motion: {entry.path.name}, as measured; ghosts: command and simulation.",
-            f"Simulated position error, RMS [mrad or mm]: {listed(worst, 3)}.",
-        ],
-        log=entry.path.name,
-    )
-
-
-def _finite_rows(t: Array, q: Array) -> tuple[Array, Array]:
-    """Return the rows without NaN."""
-    rows = np.isfinite(q).all(axis=1)
-    return t[rows], q[rows]
-
-
-def _floating(job: Job, model: RobotModel) -> RobotModel:
-    """Return a job's robot with a floating base."""
-    return RobotModel.from_urdf(
-        job.urdf,
-        joints=model.joints,
-        locked=job.locked,
-        free_flyer=True,
-        mimic=job.mimic,
-        snap_angles=job.snap_angles,
+        model, log.t, log.q + zero, torques=torques, ghosts=ghosts, notes=notes, log=entry.path.name
     )
 
 
@@ -237,15 +205,14 @@ def _base_poses(job: Job, entry: LogEntry, log: Log) -> Array | None:
     columns = table.read([time[0], *_BASE])
     pose = np.column_stack([columns[name] for name in _BASE])
     known = np.isfinite(pose).all(axis=1)
-    length = np.linalg.norm(pose[:, 3:], axis=1)
-    if not known.any() or np.abs(length[known] - 1.0).max() > 0.01:
+    if not known.any():
+        return None
+    try:
+        pose = BaseMotion(pose[known]).pose  # with continuous signs
+    except DataError as error:
         raise DataError(
-            f"{entry.path.name}: {_BASE[3]} to {_BASE[6]} is not a unit quaternion, wanted a norm "
-            "of 1; remove these columns for a fixed base"
-        )
-    pose = pose[known]
-    flips = (pose[1:, 3:] * pose[:-1, 3:]).sum(axis=1) < 0  # q and -q are the same rotation
-    pose[1:, 3:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
+            f"{entry.path.name}: {error}; remove these columns for a fixed base"
+        ) from error
     t = columns[time[0]][known]
     at = np.column_stack([np.interp(log.t, t, column) for column in pose.T])
     at[:, 3:] /= np.linalg.norm(at[:, 3:], axis=1, keepdims=True)
@@ -254,21 +221,10 @@ def _base_poses(job: Job, entry: LogEntry, log: Log) -> Array | None:
 
 def _noise(findings: Findings, model: RobotModel) -> Array | None:
     """Return the RMS residual of each joint on the fitted logs of the first result."""
-    for result in findings.results.values():
-        fitted = result["identification"]["per_joint"]
-        if all(fitted.get(joint, {}).get("rmse") for joint in model.joints):
-            return np.array([fitted[joint]["rmse"] for joint in model.joints])
-        break
-    return None
-
-
-def _track(path: Path) -> Mapping[str, Any] | None:
-    """Return the content of a track.json; None for another file."""
-    content = read_json(path, "result")
-    if not (isinstance(content, dict) and {"history", "changes"} <= set(content)):
-        return None
-    check_shape(content, schema("track"), path.name)
-    return content
+    first = next(iter(findings.results.values()), None)
+    fitted = first.content["identification"]["per_joint"] if first else {}
+    errors = [fitted.get(joint, {}).get("rmse") for joint in model.joints]
+    return np.array(errors) if all(errors) else None
 
 
 def _torques(
@@ -276,17 +232,15 @@ def _torques(
     log: Log,
     model: RobotModel,
     robots: Mapping[str, RobotModel],
-    results: Mapping[str, Mapping[str, Any]],
+    results: Mapping[str, Result],
 ) -> Torques:
     """Return measured torques, and those predicted by each result and by the URDF."""
-    shown: dict[str, Array] = {}
-    driven: dict[str, Array] = {}
-    motion = None
+    shown, driven, motion = dict[str, Array](), dict[str, Array](), None
     for label, robot in robots.items():
         rows = hold_log(robot, log, job.signals).whole
         motion = rows.trajectory
         is_driven = not driven and robot.layout.drive_names
-        beside = stated_urdf_with_drives(results[label], robot) if is_driven else None
+        beside = stated_urdf_with_drives(results[label].content, robot) if is_driven else None
         own = [robot.carried_by] if beside is None else [robot.carried_by, beside]
         predicted = [_of_moving(torque, rows.mask) for torque in predict(robot, own, motion)]
         shown[label] = predicted[0]
@@ -319,13 +273,9 @@ def _bands(track: Mapping[str, Any], folder: Path) -> Bands:
     if missing:
         raise DataError(f"{track['history']} has no column {missing[0]!r}; run robotid track again")
     columns = table.read(wanted)
-    return Bands(
-        t=columns["time"],
-        names=names,
-        units=[entry["unit"] for entry in entries],
-        theta=np.column_stack([columns[name] for name in names]),
-        std_error=np.column_stack([columns[name] for name in errors]),
-    )
+    theta, std_error = (np.column_stack([columns[x] for x in some]) for some in (names, errors))
+    units = [entry["unit"] for entry in entries]
+    return Bands(t=columns["time"], names=names, units=units, theta=theta, std_error=std_error)
 
 
 def _payloads(track: Mapping[str, Any] | None) -> list[Mark]:
@@ -367,9 +317,9 @@ def _limits_used(job: Job, motion: Log, model: RobotModel) -> tuple[list[Mark], 
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add = parser.add_argument
-    add_robot_and_log(parser)
+    add("source", metavar="URDF")
+    add("logs", nargs=1, metavar="LOG")
     results = "result.json, track.json or their folder"
     add("results", nargs="*", metavar="RESULT", help=results)
     add("--html", metavar="FILE", help="page to write; default: replay.html beside the RESULT")
@@ -379,7 +329,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     findings = read_findings(options.results)
     if findings.settings is None:
         job = job_from_flags(options)

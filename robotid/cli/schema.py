@@ -8,7 +8,7 @@ from typing import Any
 
 from robotid.base.settings import REQUIRED, Entries, Key, Settings
 from robotid.cli.job import Job, LogEntry, PayloadEntry
-from robotid.data.transmission import Transmission
+from robotid.data.signal_settings import Transmission
 from robotid.estimation.fitting.estimator_settings import ESTIMATORS, ConstraintSettings
 from robotid.robot.constraints import Contact, Loop
 from robotid.robot.parameters import Coupling
@@ -75,7 +75,6 @@ def _types(kinds: tuple[type, ...]) -> list[str]:
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add nothing but an example: the command has no flags."""
     parser.epilog = (
         "robotid schema > job.schema.json; the first line of the job file is then "
         "#:schema job.schema.json"
@@ -83,5 +82,4 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     print(json.dumps(job_schema(), indent=2))

@@ -13,23 +13,31 @@ from robotid.base.findings import listed
 from robotid.base.typing import Array, ProgressCallback, ignore_progress
 from robotid.base.versions import __version__
 from robotid.cli.console import echo, print_files, progress_of, show_found
-from robotid.cli.flags import JOB, ROBOT, Flags, add_json
-from robotid.cli.job import Job, LogEntry, as_job, job_from_settings, read_job
-from robotid.data.files.formats import check_suffix
-from robotid.data.files.read import write_log
+from robotid.cli.job import (
+    JOB,
+    ROBOT,
+    Flags,
+    Job,
+    LogEntry,
+    add_shown,
+    as_job,
+    job_from_settings,
+    read_job,
+)
+from robotid.data.files.read import check_suffix, write_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.simulation.motions import FloatingMotion, SampledMotion
-from robotid.dynamics.simulation.sensors import Run, measure
+from robotid.dynamics.simulation.motions import SampledMotion
 from robotid.dynamics.simulation.simulation_settings import Simulation, read_simulation
-from robotid.dynamics.simulation.simulator import carried, delay, follow
+from robotid.dynamics.simulation.simulator import Run, carried, delay, follow, measure
 from robotid.dynamics.simulation.truth import draw_parameters
+from robotid.output.files.result_file import SCHEMA_VERSION
 from robotid.output.files.urdf import write_urdf
 from robotid.robot.model import RobotModel
 
-_SCHEMA_VERSION = 1
+_HALF = 0.5  # of the commanded range: a joint that moves less does not follow
 
 
 def simulate(
@@ -97,47 +105,31 @@ def simulate(
     return content
 
 
-def _motion(
-    job: Job, model: RobotModel, path: Path, cutoff: float | None
-) -> SampledMotion | FloatingMotion:
+def _motion(job: Job, model: RobotModel, path: Path, cutoff: float | None) -> SampledMotion:
+    """Return the motion of a table, filtered if it was recorded."""
     table = job.read(LogEntry(path), model, needs="motion")
     smooth = None
     if cutoff is not None:
         smooth = process(table, SignalSettings(cutoff=cutoff, velocity="differentiated", trim=0.0))
-    if table.base is None:
-        course = smooth or table
-        return SampledMotion(course.t, course.q, course.v, course.a)
-    flags = [
-        np.ones(len(table.t), dtype=bool) if x.always else table.contacts[x.frame]
-        for x in model.contacts
-    ]
-    touching = np.reshape(flags, (len(flags), len(table.t))).T
-    if smooth is None:
-        return FloatingMotion(table.t, table.base.pose, table.q, touching)
-    rows = np.clip(np.searchsorted(table.t, smooth.t), 0, len(table.t) - 1)
-    return FloatingMotion(smooth.t, smooth.q[:, :7], smooth.q[:, 7:], touching[rows])
+    course = smooth or table
+    return SampledMotion(course.t, course.q, course.v, course.a)
 
 
 def _truth(
     model: RobotModel, pi: Array, settings: Simulation, run: Run, log: Log
 ) -> dict[str, Any]:
     """Return the true parameters and settings of the log, and the tracking errors."""
-    layout, size = model.layout, model.layout.n_inertial
-    mapping = structural_mapping(model)
-    units = [layout.units[i] for i in mapping.independent]
+    layout, size, mapping = model.layout, model.layout.n_inertial, structural_mapping(model)
+    base_units = [layout.units[i] for i in mapping.independent]
 
     def base(parameters: Array) -> list[dict[str, Any]]:
-        values = mapping.to_base(parameters)
-        return _rows(
-            name=mapping.base_names, value=values, unit=units, expression=mapping.expressions
-        )
+        return _rows(name=mapping.base_names, value=mapping.to_base(parameters), unit=base_units,
+                     expression=mapping.expressions)  # fmt: skip
 
-    standard = _rows(name=layout.names, value=pi, unit=layout.units)
-    for entry, value in zip(standard[:size], model.standard_parameters().tolist(), strict=False):
-        entry["urdf"] = value
+    prior = model.standard_parameters()[:size]
     error = run.q - run.reference
     content: dict[str, Any] = {
-        "schema_version": _SCHEMA_VERSION,
+        "schema_version": SCHEMA_VERSION,
         "robotid": __version__,
         "robot": model.name,
         "joints": list(model.joints),
@@ -145,8 +137,12 @@ def _truth(
         "model": model.options,
         "samples": len(log.t),
         "duration": float(run.t[-1]),
-        "standard_parameters": standard[:size],
-        "drive_parameters": standard[size:],
+        "standard_parameters": _rows(
+            name=layout.names[:size], value=pi[:size], unit=layout.units[:size], urdf=prior
+        ),
+        "drive_parameters": _rows(
+            name=layout.names[size:], value=pi[size:], unit=layout.units[size:]
+        ),
         "base_parameters": base(pi),
         "following": _rows(
             joint=model.joints,
@@ -159,8 +155,7 @@ def _truth(
         ),
     }
     if settings.payload.mass > 0:
-        loaded = carried(model, pi, settings.payload)
-        content["base_parameters_with_payload"] = base(loaded)
+        content["base_parameters_with_payload"] = base(carried(model, pi, settings.payload))
     return content
 
 
@@ -168,9 +163,6 @@ def _rows(**columns: Any) -> list[dict[str, Any]]:  # noqa: ANN401
     """Return the rows of a table of lists and arrays."""
     plain = [x.tolist() if isinstance(x, np.ndarray) else x for x in columns.values()]
     return [dict(zip(columns, row, strict=True)) for row in zip(*plain, strict=True)]
-
-
-_HALF = 0.5  # of the commanded range: a joint that moves less does not follow
 
 
 #: Flags of the keys of a plant's file.
@@ -190,7 +182,6 @@ _PLANT = Flags(
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add = parser.add_argument
     add("source", metavar="JOB.toml | URDF")
     add("motion", metavar="MOTION", help="table of time and q_<joint>, as a log or a design")
@@ -201,13 +192,12 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("--plant", metavar="FILE", help=words)
     words = "cutoff frequency of the low-pass filter of a recorded MOTION"
     add("--cutoff", type=float, metavar="HZ", help=words)
-    add_json(parser)
+    add_shown(parser, "json")
     _PLANT.add(parser.add_argument_group("these take precedence over --plant"))
     JOB.add(parser.add_argument_group("the robot"), ROBOT)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     job, settings = simulation_from_flags(options)
     with progress_of(options) as progress:
         content = simulate(
@@ -252,23 +242,18 @@ def _show(content: dict[str, Any]) -> None:
             "from a recorded log, and than those of a preview, which assumes noise. Add noise with "
             "--torque-noise 0.02, a share of the torque"
         )
-    head = "position error"
-    width = max(len(head), *(len(joint) for joint in content["joints"]))
-    print(f"\n{head:{width}}  rms, largest")
+    width = max(map(len, ("position error", *content["joints"])))
+    print(f"\n{'position error':{width}}  rms, largest")
     for joint in content["following"]:
-        line = f"{joint['joint']:{width}}  {joint['rms']:.2g}, {joint['largest']:.2g}"
-        line += f" {joint['unit']}"
-        if joint["at_limit"] > 0:
-            line += f"; at the effort limit for {100 * joint['at_limit']:.2g} % of the time"
-        print(line)
-    for joint in content["following"]:
+        name, unit = joint["joint"], joint["unit"]
+        print(f"{name:{width}}  {joint['rms']:.2g}, {joint['largest']:.2g} {unit}", end="")
+        share = 100 * joint["at_limit"]
+        print(f"; at the effort limit for {share:.2g} % of the time" if share > 0 else "")
         if joint["range"] < _HALF * joint["commanded"]:
-            name, unit = joint["joint"], joint["unit"]
             echo(
-                f"warning: {name} moves {joint['range']:.2g} {unit}, wanted the "
+                f"  warning: {name} moves {joint['range']:.2g} {unit}, wanted the "
                 f"{joint['commanded']:.2g} {unit} commanded. If its friction stops it, state it in "
                 "the file of --plant: "
                 f'[truth] values = {{ "{name}.coulomb" = 0 }}, or larger gains under [controller]',
-                "  ",
-                "warning",
-            )
+                "  ", "warning",
+            )  # fmt: skip

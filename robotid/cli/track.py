@@ -1,139 +1,93 @@
 """robotid track: run the online estimator over a log: history, step changes."""
 
 import argparse
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from robotid.base.exceptions import MissingDependencyError, SettingsError
+from robotid.base.exceptions import SettingsError
 from robotid.base.files import check_folder, file_sha256, folder_beside, write_json
 from robotid.base.text import columns, in_digits_of
 from robotid.base.versions import __version__
 from robotid.cli.console import echo, show_found
-from robotid.cli.flags import (
-    JOB,
-    ONLINE,
-    add_json,
-    add_out,
-    add_robot_and_log,
-    add_verbose,
-    job_from_flags,
-)
-from robotid.cli.job import Job
-from robotid.data.files.formats import write_columns
-from robotid.data.files.parquet_files import load_pyarrow
+from robotid.cli.job import JOB, ONLINE, Job, add_out, add_shown, job_from_flags
+from robotid.data.files.read import write_columns
 from robotid.data.log import Log
-from robotid.identification.online import (
-    OnlineIdentifier,
-    OnlineSettings,
-    Track,
-    track,
-)
-
-_SCHEMA = 1
+from robotid.identification.online import OnlineIdentifier, OnlineSettings, Track, track
+from robotid.output.files.result_file import SCHEMA_VERSION
 
 
-def run_track(job: Job, folder: str | Path | None) -> dict[str, Any]:
+def run_track(job: Job, folder: str | Path) -> dict[str, Any]:
     """Track the one log of a job, write the history and track.json, and return its content."""
-    model, history = job.model(), _history_name()
-    if folder is not None:
-        inputs = [job.urdf, *(entry.path for entry in job.identification)]
-        check_folder(Path(folder), [history, "track.json"], inputs)
-    if len(job.identification) != 1:
-        raise SettingsError(f"{len(job.identification)} logs are given, wanted one to track")
-    log = job.read(job.identification[0], model)
+    model = job.model()
+    history = "track.parquet" if find_spec("pyarrow") else "track.csv"
+    inputs = [job.urdf, *(entry.path for entry in job.identification)]
+    check_folder(Path(folder), [history, "track.json"], inputs)
+    (entry,) = job.identification
+    log = job.read(entry, model)
     if job.signals.cutoff is None:
         raise SettingsError(
             "the cutoff is disabled, but the online estimator differentiates positions; state a "
             "cutoff in Hz"
         )
-    step = float(np.median(np.diff(log.t)))
+    rate = job.signals.rate or 1.0 / float(np.median(np.diff(log.t)))
     settings = OnlineSettings(
-        rate=job.signals.rate or 1.0 / step,
-        cutoff=job.signals.cutoff,
-        min_velocity=job.signals.min_velocity,
+        rate=rate, cutoff=job.signals.cutoff, min_velocity=job.signals.min_velocity
     )
-    found = track(model, log, settings)
-    content = _summary(found, job, log, history)
-    if folder is not None:
-        target = Path(folder)
-        target.mkdir(parents=True, exist_ok=True)
-        with folder_beside(target) as partial:
-            write_columns(found.columns(), partial / history)
-            write_json(content, partial / "track.json")
+    tracked = track(model, log, settings)
+    content = _summary(tracked, job, log, history)
+    target = Path(folder)
+    target.mkdir(parents=True, exist_ok=True)
+    with folder_beside(target) as partial:
+        write_columns(tracked.columns(), partial / history)
+        write_json(content, partial / "track.json")
     return content
 
 
-def _history_name() -> str:
-    try:
-        load_pyarrow("writing Parquet")
-    except MissingDependencyError:
-        return "track.csv"
-    return "track.parquet"
-
-
-def _summary(found: Track, job: Job, log: Log, history: str) -> dict[str, Any]:
-    identifier = found.identifier
+def _summary(tracked: Track, job: Job, log: Log, history: str) -> dict[str, Any]:
+    identifier = tracked.identifier
     model, mapping = identifier.model, identifier.mapping
-    converged = np.flatnonzero(found.converged)
-    last = identifier.reading
-    columns = {
-        "name": mapping.base_names,
-        "expression": mapping.expressions,
-        "value": last.theta.tolist(),
-        "std_error": last.std_error.tolist(),
-        "unit": [model.layout.units[i] for i in mapping.independent],
-    }
+    converged, last = tracked.t[tracked.converged].tolist(), identifier.reading
+    units = [model.layout.units[i] for i in mapping.independent]
+    rows = zip(mapping.base_names, mapping.expressions, last.theta.tolist(),
+               last.std_error.tolist(), units, strict=True)  # fmt: skip
+    keys = ("name", "expression", "value", "std_error", "unit")
+    inputs = {"urdf": str(job.urdf), "log": log.path}
     return {
-        "schema_version": _SCHEMA,
-        "robotid": __version__,
-        "robot": model.name,
-        "joints": list(model.joints),
-        "settings": job.to_dict(),
+        "schema_version": SCHEMA_VERSION, "robotid": __version__, "robot": model.name,
+        "joints": list(model.joints), "settings": job.to_dict(),
         "inputs": [
-            {"role": "urdf", "path": str(job.urdf), "sha256": file_sha256(job.urdf)},
-            {"role": "log", "path": log.path, "sha256": file_sha256(log.path)},
+            {"role": role, "path": path, "sha256": file_sha256(path)}
+            for role, path in inputs.items()
         ],
-        "samples": len(log.t),
-        "delay": identifier.delay,
-        "first_estimate": float(found.t[0]),
-        "converged_at": float(found.t[converged[0]]) if len(converged) else None,
-        "excitation": last.excitation,
+        "samples": len(log.t), "delay": identifier.delay, "first_estimate": float(tracked.t[0]),
+        "converged_at": converged[0] if converged else None, "excitation": last.excitation,
         "sigma": dict(zip(model.row_names, last.sigma.tolist(), strict=True)),
-        "base_parameters": [
-            dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
-        ],
+        "base_parameters": [dict(zip(keys, row, strict=True)) for row in rows],
         "changes": [_change(identifier, index) for index in range(len(identifier.changes))],
         "history": history,
-    }
+    }  # fmt: skip
 
 
 def _change(identifier: OnlineIdentifier, index: int) -> dict[str, Any]:
     """Return a change with its equivalent payload, estimated up to the end of the log."""
     change, load = identifier.changes[index], identifier.payload(index)
-    return {
-        "flagged": change.flagged,
-        "onset": change.onset,
-        "payload": {
-            "body": identifier.model.layout.bodies[-1],
-            "mass": load.mass,
-            "std_error": load.mass_std_error,
-        },
-    }
+    body = identifier.model.layout.bodies[-1]
+    payload = {"body": body, "mass": load.mass, "std_error": load.mass_std_error}
+    return {"flagged": change.flagged, "onset": change.onset, "payload": payload}
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
-    add_robot_and_log(parser)
+    parser.add_argument("source", metavar="URDF")
+    parser.add_argument("logs", nargs=1, metavar="LOG")
     add_out(parser, "robotid-track")
-    add_json(parser, "track.json")
+    add_shown(parser, "verbose", json="print track.json")
     JOB.add(parser.add_argument_group("the log"), ONLINE)
-    add_verbose(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     content = run_track(job_from_flags(options), options.out)
     show_found(content, options, _show, [content["history"], "track.json"])
 

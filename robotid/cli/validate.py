@@ -1,9 +1,8 @@
 """robotid validate: compute a result's prediction error on other logs."""
 
 import argparse
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from itertools import compress
 from pathlib import Path
 from typing import Any
@@ -11,22 +10,12 @@ from typing import Any
 import numpy as np
 
 from robotid.base.exceptions import DataError
-from robotid.base.files import (
-    check_file,
-    file_sha256,
-    finite,
-    log_exists,
-    read_json,
-    source_entry,
-    write_json,
-)
+from robotid.base.files import file_sha256, finite, log_exists, source_entry
 from robotid.base.findings import Finding, listed
 from robotid.base.text import terminal_width
 from robotid.cli.console import echo, print_verdict, show_found
-from robotid.cli.flags import add_json
-from robotid.cli.job import Job, LogEntry, written_job
-from robotid.cli.logs import log_of_commands, survey_logs, units_of_logs
-from robotid.data.log import Log
+from robotid.cli.job import Job, LogEntry, add_shown, written_job
+from robotid.cli.logs import fitted_hashes, log_of_commands, survey_logs
 from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.diagnosis.verdict.fit_findings import unlike_findings
 from robotid.diagnosis.verdict.verdict import (
@@ -40,6 +29,7 @@ from robotid.diagnosis.verdict.verdict import (
     warnings_of,
 )
 from robotid.dynamics.base_parameters import structural_mapping
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.evaluation import (
     Evaluation,
     Metrics,
@@ -55,7 +45,7 @@ from robotid.estimation.variation.groups import RunSums, runs_of
 from robotid.estimation.variation.variation import vary
 from robotid.identification.closed_loop.position_errors import pool_positions
 from robotid.identification.repeated_errors import with_repeated_errors
-from robotid.identification.summary import error_lines, variation_lines
+from robotid.identification.summary import error_lines
 from robotid.output.files.result_file import (
     Result,
     load_result,
@@ -68,37 +58,14 @@ from robotid.output.files.result_file import (
 )
 from robotid.robot.model import RobotModel
 
-_ADVICE = "identify again from all logs"
 
-
-def check_update(result: Result, job: Job, entries: Sequence[LogEntry]) -> None:
-    """Check that logs can be added to the variation of a result."""
-    stated = result.content.get("variation", {})
-    if "sums" not in stated:
-        raise DataError(
-            f"{result.path.name} has no variation to which logs can be added, wanted a result of "
-            f"three or more logs with torques; {_ADVICE}"
-        )
-    known = [x for x in result.content["inputs"] if x["role"] == "identification"]
-    of_file = {x["sha256"]: x["path"] for x in (*known, *stated.get("added", ()))}
-    for entry in entries:
-        own = source_entry(str(entry.path))["sha256"]
-        if own in of_file:
-            raise DataError(
-                f"{entry.path} is {of_file[own]}, which {result.path.name} has already; "
-                "leave it out"
-            )
-        of_file[own] = str(entry.path)
-    units_of_logs([*job.identification, *entries])
-
-
-def add_logs(
-    result: Result, model: RobotModel, job: Job, logs: Sequence[SurveyedLog]
-) -> tuple[dict[str, Any], tuple[Finding, ...]] | None:
+def compare_runs(
+    result: Result, model: RobotModel, logs: Sequence[SurveyedLog], estimator: EstimatorSettings
+) -> tuple[dict[str, Any], tuple[Finding, ...]]:
     """Return the variation between the logs of a result and new ones, and findings about these."""
     stated = result.content.get("variation", {})
     if "sums" not in stated:
-        return None
+        return {}, ()
     mapping, before = structural_mapping(model), stated["sums"]
     recordings = with_repeated_errors(Recordings(model, mapping, logs))
     pi, old = stated_parameters(result.content, model), RunSums.from_dict(before)
@@ -106,37 +73,29 @@ def add_logs(
     try:
         if old.sigma.shape != (model.n_rows,) or not (old.sigma > 0).all():
             raise ValueError(f"sigma is {old.sigma}")
-        sums = old.joined(sums_of_logs(recordings, job.estimator, pi, old.sigma, shift))
+        sums = old.joined(sums_of_logs(recordings, estimator, pi, old.sigma, shift))
     except ValueError as error:
         raise DataError(
             f"variation.sums in {result.path.name} does not fit the robot ({error}): another "
-            f"version of robotid wrote it; {_ADVICE}"
+            "version of robotid wrote it; identify again from all logs"
         ) from error
-    new_units = [log.unit or any(before["unit"]) * Path(log.path).name for log in logs]
-    units = [*before["unit"], *new_units]
-    unit_names, unit = np.unique(units, return_inverse=True)
+    names = [Path(log.path).name for log in logs]
+    units = [log.unit or any(before["unit"]) * name for log, name in zip(logs, names, strict=True)]
+    unit_names, unit = np.unique([*before["unit"], *units], return_inverse=True)
     groups = runs_of(model, mapping, pi, sums, unit)
-    names = [*stated["logs"], *(Path(log.path).name for log in logs)]
-    varied = vary(names, groups, unit_names.tolist())
+    varied = vary([*stated["logs"], *names], groups, unit_names.tolist())
     assert varied is not None
     count = len(stated["logs"])
     unlike = replace(
         varied,
-        unlike=tuple(each for each in varied.unlike if each.run >= count),
-        unlike_units=tuple(each for each in varied.unlike_units if each.run in unit[count:]),
+        unlike=tuple(run for run in varied.unlike if run.run >= count),
+        unlike_units=tuple(run for run in varied.unlike_units if run.run in unit[count:]),
     )
     added = [source_entry(log.path) for log in logs]
-    content = varied.to_dict() | {
-        "sums": sums.to_dict() | {key: before[key] for key in ("shift",) if key in before}
-        | {"unit": units},
-        "added": [*stated.get("added", ()), *added],
-    }  # fmt: skip
-    return content, tuple(unlike_findings(unlike))
+    return varied.to_dict() | {"added": added}, tuple(unlike_findings(unlike))
 
 
-def validate(
-    result: str | Path, logs: Sequence[LogEntry | str | Path], *, update: bool = False
-) -> dict[str, Any]:
+def validate(result: str | Path, logs: Sequence[LogEntry | str | Path]) -> dict[str, Any]:
     """Compute the prediction error of a written result on other logs.
 
     If the result has a URDF, the prediction uses that file and its sidecar, as a user does. The
@@ -146,21 +105,16 @@ def validate(
     Args:
         result: A result.json or its folder.
         logs: Files of logs, read with the settings of the result.
-        update: Whether the logs are added to the variation between logs in the result.json.
 
     Returns:
         The errors of each log and the verdict, as ``robotid validate --json``.
 
     Raises:
         DataError: If a log cannot be used.
-        SettingsError: If the result cannot be updated.
     """
     loaded = load_result(result)
     content, job = loaded.content, written_job(loaded.content["settings"], loaded.path.name)
     entries = [log if isinstance(log, LogEntry) else LogEntry(Path(log)) for log in logs]
-    if update:
-        check_file(loaded.path)
-        check_update(loaded, job, entries)
     if "simulation" in content:
         return _validate_commands(loaded, job, entries)
     source = stated_model(content, job.model())
@@ -174,18 +128,14 @@ def validate(
     driven = stated_urdf_with_drives(content, source)
     _, evaluations = evaluate_logs((), surveyed, {"estimate": pi}, prior, driven)
     own = [log.with_model(source) for log in surveyed]
-    variation, unlike = add_logs(loaded, source, job, own) or ({}, ())
+    variation, unlike = compare_runs(loaded, source, own, job.estimator)
     verdict = _verdict(job, source, content, evaluations, surveyed, unlike)
-    if update:
-        stored = read_json(loaded.path, "result")  # with the keys as they are in the file
-        write_json({**stored, "variation": variation}, loaded.path)
-    shown = {key: x for key, x in variation.items() if key != "sums"}
     return {
         "result": str(result),
         "predicted_with": content["outputs"].get("urdf", "base parameters of result.json"),
         "validation": [e.to_dict() | _expected(content, model, e) for e in evaluations],
         "verdict": verdict.to_dict(),
-        **({"variation": shown} if shown else {}),
+        **({"variation": variation} if variation else {}),
         "findings": [asdict(finding) for finding in unlike],
     }
 
@@ -223,33 +173,19 @@ def _validate_commands(loaded: Result, job: Job, entries: Sequence[LogEntry]) ->
     model = loaded.robot
     logs = [log_of_commands(job, entry, loaded) for entry in entries]
     runs = [loaded.open_loop(log) for log in logs]
-    hashes = {i["sha256"] for i in loaded.content["inputs"] if i["role"] == "identification"}
-    is_validation = not any(file_sha256(entry.path) in hashes for entry in entries)
+    hashes = fitted_hashes(loaded.content)
     log_errors = blocking(diagnose(model, (), logs, job.signals), job.ignore)
     verdict = judge_positions(
-        pool_positions(runs, moving=True),
-        model.joints,
-        is_validation=is_validation,
+        pool_positions(runs, moving=True), model.joints,
+        is_validation=not any(file_sha256(entry.path) in hashes for entry in entries),
         log_errors=[finding.message for finding in log_errors],
-    )
+    )  # fmt: skip
     return {
         "result": str(loaded.path),
         "predicted_with": loaded.content["outputs"]["urdf"],
         "validation": [run.to_dict() for run in runs],
         "verdict": verdict.to_dict(),
     }
-
-
-def _fitted_logs(
-    job: Job, model: RobotModel, hashes: Collection[str]
-) -> tuple[list[Log], list[str]]:
-    """Return the fitted logs, windows of long ones, and the names of missing ones."""
-    exists = [log_exists(e.path) and file_sha256(e.path) in hashes for e in job.identification]
-    missing = [
-        e.path.name for e, found in zip(job.identification, exists, strict=True) if not found
-    ]
-    (surveyed,) = survey_logs(job, model, list(compress(job.identification, exists)))
-    return [look for log in surveyed for look in log.looks], missing
 
 
 def _verdict(
@@ -261,101 +197,68 @@ def _verdict(
     unlike: Sequence[Finding],
 ) -> Verdict:
     """Return the verdict on logs, which may be fitted, faulty, unlike, or of a fitted motion."""
-    hashes = {i["sha256"] for i in result["inputs"] if i["role"] == "identification"}
-    fitted, missing = _fitted_logs(job, model, hashes)
-    again = [
-        file_sha256(log.path) in hashes or any(_share(a, b) for a in log.looks for b in fitted)
+    hashes, is_robust = fitted_hashes(result), job.estimator.is_robust
+    is_there = [log_exists(e.path) and file_sha256(e.path) in hashes for e in job.identification]
+    (surveyed,) = survey_logs(job, model, list(compress(job.identification, is_there)))
+    fitted = [look for log in surveyed for look in log.looks]
+    again = [  # whether a log is a fitted one, or a cut or thinned copy
+        file_sha256(log.path) in hashes
+        or any(shares_rows(a, b) or shares_rows(b, a) for a in log.looks for b in fitted)
         for log in logs
     ]
     is_new = [not is_refitted for is_refitted in again]
     looks = [look for log in compress(logs, is_new) for look in log.looks]
     names = list(dict.fromkeys(Path(log.path).name for log in looks))
-    found = [
-        finding
-        for finding in diagnose(model, fitted, looks, job.signals)
-        if finding.where.split(": ")[0] in names and finding.code not in job.ignore
-    ]
-    found += [each for each in unlike if each.code not in job.ignore]
-    log_errors = blocking(found, job.ignore, is_robust=job.estimator.is_robust)
+    of_doctor = diagnose(model, fitted, looks, job.signals)
+    found = [*(x for x in of_doctor if x.where.split(": ")[0] in names), *unlike]
+    found = [finding for finding in found if finding.code not in job.ignore]
+    log_errors = [x.message for x in blocking(found, job.ignore, is_robust=is_robust)]
     stated = result["verdict"]
-    predictions = Predictions(
-        Metrics({}, 0.0),
-        {e.recording.name: e.metrics["estimate"] for e in compress(evaluations, is_new)},
-        tuple(joint for joint in model.joints if joint not in model.passive),
-        refitted=[e.recording.name for e in compress(evaluations, again)],
-        hidden=hidden_joints(model, evaluations),
-    )
-    determined = Determined(
-        result["structure"]["undetermined"],
-        result["consistency"]["is_consistent"],
-        result["structure"].get("poorly_excited", True),
-        model.is_static,
-    )
-    return judge(
-        predictions,
-        determined,
-        log_errors=list(
-            dict.fromkeys([*stated.get("log_errors", ()), *(f.message for f in log_errors)])
-        ),
-        warnings=list(dict.fromkeys(_warnings(job, model, stated, found, names, missing))),
-        scale_check=stated_scale_check(result),
-    )
-
-
-def _warnings(
-    job: Job,
-    model: RobotModel,
-    stated: Mapping[str, Any],
-    found: Sequence[Finding],
-    names: Sequence[str],
-    missing: Sequence[str],
-) -> list[VerdictWarning]:
-    """Return the warnings of the result, without those of its validation, and of the new logs."""
-    own = [VerdictWarning(**warning) for warning in stated.get("warnings", ())]
-    is_robust = job.estimator.is_robust
-    warnings = [warning for warning in own if warning.code != "repeated_motion"]
+    warnings = [VerdictWarning(**warning) for warning in stated.get("warnings", ())]
+    warnings = [warning for warning in warnings if warning.code != "repeated_motion"]
     warnings += warnings_of(found, model.joints, names, is_robust=is_robust)
-    if missing:
+    if not all(is_there):
+        missing = [e.path.name for e in compress(job.identification, np.logical_not(is_there))]
         message = (
             f"the fitted logs {listed(missing)} are missing or were changed: rows of these "
             "recordings were not compared with fitted rows"
         )
         warnings.append(VerdictWarning("fitted_logs_missing", "", message))
-    return warnings
-
-
-def _share(one: Log, other: Log) -> bool:
-    """Return whether one of two logs contains rows of the other, as a cut or thinned copy."""
-    return shares_rows(one, other) or shares_rows(other, one)
+    structure = result["structure"]
+    return judge(
+        Predictions(
+            Metrics({}, 0.0),
+            {e.recording.name: e.metrics["estimate"] for e in compress(evaluations, is_new)},
+            tuple(joint for joint in model.joints if joint not in model.passive),
+            refitted=[e.recording.name for e in compress(evaluations, again)],
+            hidden=hidden_joints(model, evaluations),
+        ),
+        Determined(
+            structure["undetermined"], result["consistency"]["is_consistent"],
+            structure.get("poorly_excited", True), model.is_static,
+        ),
+        log_errors=list(dict.fromkeys([*stated.get("log_errors", ()), *log_errors])),
+        warnings=list(dict.fromkeys(warnings)),
+        scale_check=stated_scale_check(result),
+    )  # fmt: skip
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add = parser.add_argument
     add("result", metavar="RESULT.json")
     add("logs", nargs="+", metavar="LOG")
     words = "name of the robot of the logs, if the fitted logs are of several"
     add("--unit", metavar="NAME", help=words)
-    words = "add the logs to the variation between logs in RESULT.json"
-    add("--update", action="store_true", help=words)
-    add_json(parser)
+    add_shown(parser, "json")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
-    entries = [_entry(log, options) for log in options.logs]
-    found = validate(options.result, entries, update=options.update)
-    show_found(found, options, partial(_show, is_update=options.update))
-
-
-def _entry(log: str, options: argparse.Namespace) -> "LogEntry":
-    """Return a log with its robot, checked as in a job file."""
     unit = {} if options.unit is None else {"unit": options.unit}
-    return LogEntry.from_dict({"log": log, **unit})
+    entries = [LogEntry.from_dict({"log": log, **unit}) for log in options.logs]
+    show_found(validate(options.result, entries), options, _show)
 
 
-def _show(found: dict[str, Any], *, is_update: bool = False) -> None:
-
+def _show(found: dict[str, Any]) -> None:
     echo(f"predicted with {found['predicted_with']}")
     for recording in found["validation"]:
         echo(f"\n{recording['name']}", "  ")
@@ -365,18 +268,12 @@ def _show(found: dict[str, Any], *, is_update: bool = False) -> None:
             source = "fit, for logs of the same day"
             if expected["with_spread"]:
                 source = "fit and spread between logs"
-            own = [
-                f"{joint} {each['rmse']:.3g} ({each['within_95_pct']:.0f} %)"
-                for joint, each in expected["per_joint"].items()
-                if each["within_95_pct"] is not None
-            ]
-            echo(
-                f"expected rmse by the {source} (share of rows within 95 %): {', '.join(own)}", "  "
+            figures = ", ".join(
+                f"{joint} {error['rmse']:.3g} ({error['within_95_pct']:.0f} %)"
+                for joint, error in expected["per_joint"].items()
+                if error["within_95_pct"] is not None
             )
+            echo(f"expected rmse by the {source} (share of rows within 95 %): {figures}", "  ")
     for finding in found.get("findings", ()):
         echo(f"\n{finding['message']}")
     print_verdict(found["verdict"])
-    if is_update:
-        echo(f"the variation between logs in {found['result']} counts these logs now:")
-        for line in variation_lines(found["variation"]):
-            echo(line, "  ")

@@ -34,12 +34,12 @@ _IMU_REMEDY = (
     "Record imu_wx, imu_wy, imu_wz [rad/s], imu_ax, imu_ay, imu_az [m/s^2], and the orientation "
     "imu_qx, imu_qy, imu_qz, imu_qw, or that of the base"
 )
-_TURN = 2.0 * np.pi  # [rad] larger roll and pitch are in degrees
 _UNIT = 1e-3  # tolerance of the norm of a logged quaternion
 _BESIDE, _USUAL = 32, 75.0  # rows beside a step, and the percentile of their steps ...
 _JUMPS = 15.0  # ... times which a step relative to those before and after it is a jump ...
 _SMALLEST = (5e-3, 0.02)  # [m], [rad] ... if it is not below this
-_GAP = 2.5  # median steps of time: a longer one is a gap, over which the pose may change
+#: Median steps of time: a longer one is a gap, unless the filter is slower.
+GAP_STEPS = 2.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,27 +49,22 @@ class ImuFrame:
     quaternion: Array  # orientation of the IMU in the base link, qx qy qz qw, shape (4,)
     lever: Array  # origin of the IMU in the base link, shape (3,) [m]
     gravity: Array  # gravity in the world, shape (3,) [m/s^2]
-    # bias of the gyroscopes with the axes of the base, shape (3,) [rad/s]; None to estimate it at
-    # rest
-    bias: Array | None = None
-    # bias of the accelerometers with the axes of the base, shape (3,) [m/s^2]; None: 0
-    offset: Array | None = None
+    bias: Array | None = None  # of the gyroscopes, base axes (3,) [rad/s]; None: estimate at rest
+    offset: Array | None = None  # of the accelerometers, base axes (3,) [m/s^2]; None: 0
 
     @property
     def rotation(self) -> Array:
         """Axes of the IMU in the base link, shape (3, 3)."""
         x, y, z, w = self.quaternion
         S = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        rotation: Array = np.eye(3) + 2.0 * (w * S + S @ S)
-        return rotation
+        return np.asarray(np.eye(3) + 2.0 * (w * S + S @ S))
 
 
 @dataclass(frozen=True, eq=False)
 class ImuMotion:
     """Recorded values of an IMU with the axes of the base link."""
 
-    # angular velocity without bias [rad/s] and specific force, the acceleration minus gravity
-    # [m/s^2], shape (N, 6)
+    # angular velocity without bias [rad/s], and acceleration minus gravity [m/s^2], shape (N, 6)
     values: Array
     frame: ImuFrame  # place of the IMU, with the bias that was subtracted
 
@@ -80,28 +75,15 @@ class ImuMotion:
 
 @dataclass(frozen=True, eq=False)
 class BaseMotion:
-    """Recorded motion of a floating base, sample by sample. The arrays are read-only.
+    """Recorded motion of a floating base, sample by sample. The arrays are read-only."""
 
-    Attributes:
-        pose: Position of the base link in the world [m] and its orientation as a quaternion,
-            x y z qx qy qz qw, shape (N, 7). Quaternions are normalised, with continuous signs.
-        twist: Linear [m/s] and angular velocity [rad/s] with the axes of the base link, shape
-            (N, 6); None if it was not recorded.
-        acceleration: Time derivative of the twist, shape (N, 6) [m/s^2, rad/s^2]; None if it was
-            not recorded.
-        imu: Values of an IMU, which determine angular velocity and acceleration; None without one.
-            The position is 0 if it was not recorded.
-        link: The link whose pose it is; "" for the root link. Only the root link has velocities.
-
-    Raises:
-        DataError: If a shape is not the expected one, or a quaternion is not of length 1.
-    """
-
+    # position in the world [m], 0 if not recorded, and orientation, x y z qx qy qz qw, (N, 7);
+    # quaternions become normalised, with continuous signs
     pose: Array
-    twist: Array | None = None
-    acceleration: Array | None = None
-    imu: ImuMotion | None = None
-    link: str = ""
+    twist: Array | None = None  # linear [m/s] and angular velocity [rad/s], base axes, (N, 6)
+    acceleration: Array | None = None  # time derivative of the twist, (N, 6) [m/s^2, rad/s^2]
+    imu: ImuMotion | None = None  # determines angular velocity and acceleration
+    link: str = ""  # whose pose it is; "": the root link, which alone has velocities
 
     def __post_init__(self) -> None:
         for name, width in (("pose", 7), ("twist", 6), ("acceleration", 6)):
@@ -114,19 +96,13 @@ class BaseMotion:
                 f"the quaternion of the base has length {sizes[wrong[0]]:g} in row {wrong[0]}, "
                 "wanted 1, in the order qx qy qz qw"
             )
-        is_opposite = np.sum(self.pose[1:, 3:] * self.pose[:-1, 3:], axis=1) < 0
-        signs = np.where(np.append(0, np.cumsum(is_opposite)) % 2, -1.0, 1.0)
         pose = self.pose.copy()
-        pose[:, 3:] *= (signs / sizes)[:, None]
+        pose[:, 3:] *= continuous_signs(pose[:, 3:]) / sizes[:, None]
         pose.flags.writeable = False
         object.__setattr__(self, "pose", pose)
 
     def at(self, rows: slice) -> "BaseMotion":
-        """Return some samples.
-
-        Args:
-            rows: Their numbers.
-        """
+        """Return some samples."""
         imu = None if self.imu is None else self.imu.at(rows)
         arrays = {"pose": self.pose, "twist": self.twist, "acceleration": self.acceleration}
         some: dict[str, Any] = {name: x[rows] for name, x in arrays.items() if x is not None}
@@ -142,32 +118,21 @@ class BaseMotion:
 class BaseColumns:
     """The columns of a floating base and of contacts that are read from a file.
 
-    Attributes:
-        floats: Whether the motion of a floating base is read: ``base_x`` to ``base_z`` [m] and
-            ``base_qx`` to ``base_qw``, or ``base_roll``, ``base_pitch``, ``base_yaw`` [rad]; also
-            velocities ``base_vx`` to ``base_wz`` and accelerations ``base_ax`` to ``base_alz``, if
-            they are there.
-        contacts: Links whose contacts are read from ``contact_<link>``, 1 or 0.
-        wrenches: Components of wrenches, as "fz l_sole" from ``wrench_fz_l_sole``. With these, a
-            log need not have torques.
-        twist: Axes of the velocities: "base" or "world".
-        thresholds: For each contact the force above which it counts, if its column is a force, or
-            None; empty: none is.
-        local: Links whose wrenches have the axes of the link instead of the world's.
-        imu: Place of an IMU in the base, whose ``imu_wx`` to ``imu_az`` replace velocities and
-            accelerations; orientation is that of the base, or of the IMU, ``imu_qx`` to
-            ``imu_qw``; the position may be missing. None without an IMU.
-        link: The link whose pose is read; "" for the root link. Its velocities are not read.
+    The pose is ``base_x`` to ``base_z`` [m] and ``base_qx`` to ``base_qw``, or ``base_roll``,
+    ``base_pitch``, ``base_yaw`` [rad]. Velocities ``base_vx`` to ``base_wz`` and accelerations
+    ``base_ax`` to ``base_alz`` are optional. An IMU's ``imu_wx`` to ``imu_az`` replace these; its
+    orientation is that of the base or ``imu_qx`` to ``imu_qw``, and the position may be missing.
     """
 
-    floats: bool = False
-    contacts: tuple[str, ...] = ()
-    wrenches: tuple[str, ...] = ()
-    twist: str = "base"
+    floats: bool = False  # whether the motion of a floating base is read
+    contacts: tuple[str, ...] = ()  # links whose contacts are read, ``contact_<link>``, 1 or 0
+    wrenches: tuple[str, ...] = ()  # as "fz l_sole", ``wrench_fz_l_sole``: torques may be missing
+    twist: str = "base"  # axes of the velocities: "base" or "world"
+    # of each contact the force from which it counts, None if its column is no force; empty: none is
     thresholds: tuple[float | None, ...] = ()
-    local: tuple[str, ...] = ()
-    imu: ImuFrame | None = None
-    link: str = ""
+    local: tuple[str, ...] = ()  # links whose wrenches have their axes, not the world's
+    imu: ImuFrame | None = None  # place of an IMU in the base
+    link: str = ""  # whose pose is read, without velocities; "": the root link
 
     @property
     def needs_heading(self) -> bool:
@@ -179,11 +144,7 @@ class BaseColumns:
         return any(part != vertical and link not in self.local for part, link in pairs)
 
     def present(self, names: Collection[str]) -> "BaseColumns":
-        """Return the same with only those contacts that a file has; the others may be found.
-
-        Args:
-            names: Names of its columns, and standard names that are renamed.
-        """
+        """Return the same with only those contacts that a file has; the others may be found."""
         kept = [k for k, link in enumerate(self.contacts) if f"contact_{link}" in names]
         limits = self.thresholds or (None,) * len(self.contacts)
         return replace(
@@ -198,77 +159,66 @@ def base_columns(
 ) -> dict[str, list[str]]:
     """Return the columns of a floating base and of contacts in a file, by kind."""
     names = [*names, *columns]
-    found = _columns_of_base(where, names, wanted) if wanted.floats else {}
-    found["contact"] = [f"contact_{link}" for link in wanted.present(names).contacts]
-    found["wrench"] = [f"wrench_{name.replace(' ', '_', 1)}" for name in wanted.wrenches]
-    if missing := [name for name in found["wrench"] if name not in names]:
+    by_kind = _columns_of_base(where, names, wanted) if wanted.floats else {}
+    by_kind["contact"] = [f"contact_{link}" for link in wanted.present(names).contacts]
+    by_kind["wrench"] = [f"wrench_{name.replace(' ', '_', 1)}" for name in wanted.wrenches]
+    if missing := [name for name in by_kind["wrench"] if name not in names]:
         seen = [name for name in names if name.startswith("wrench_")]
         cells = [x for x in seen if x.startswith(tuple(f"{name}_" for name in missing))]
-        sums = (
-            f"If {listed(cells)} are cells of a foot, add a column of their sum. " if cells else ""
-        )
+        sums = f"If {listed(cells)} are cells of a foot, add a column of their sum. "
         raise DataError(
             f"{where} has no column {listed(missing)}; columns of that kind found: {listed(seen)}. "
-            f"{sums}Name the column in [columns], or remove the component from measured in "
-            "[[contact]]",
+            f"{sums if cells else ''}Name the column in [columns], or remove the component from "
+            "measured in [[contact]]",
             code="missing_column",
         )
     return {
         kind if kind in ("contact", "wrench") else f"base {kind}": [columns.get(x, x) for x in own]
-        for kind, own in found.items()
+        for kind, own in by_kind.items()
         if own
     }
 
 
 def _columns_of_base(where: str, names: Sequence[str], wanted: BaseColumns) -> dict[str, list[str]]:
     """Return the columns of the motion of the base, by kind."""
-    forms = {"pose": POSE, "angles": _ANGLES, "twist": TWIST, "acceleration": ACCELERATION}
-    if wanted.link:
-        forms = {"pose": POSE, "angles": _ANGLES}
-    whole = {kind: [f"base_{end}" for end in ends] for kind, ends in forms.items()}
+    forms = {"pose": ("base", POSE), "angles": ("base", _ANGLES)}
     orientations = ["pose", "angles"]
     if wanted.imu is not None:
-        whole = {kind: whole[kind] for kind in orientations}
-        whole |= {
-            "imu quaternion": [f"imu_{end}" for end in IMU[:4]],
-            "quaternion": [f"base_{end}" for end in POSE[3:]],
-            "rpy": [f"base_{end}" for end in _ANGLES[3:]],
-            "imu": [f"imu_{end}" for end in IMU[4:]],
-        }
-        orientations = [kind for kind in whole if kind != "imu"]
-    found = {kind: own for kind, own in whole.items() if set(own) <= set(names)}
-    used = next((kind for kind in orientations if kind in found), "")
-    required = ["imu"] if wanted.imu is not None else []
-    missing = [x for kind in required for x in whole[kind] if x not in names]
-    is_blind = wanted.needs_heading or (wanted.imu is not None and not wanted.imu.gravity.any())
-    if not used and not missing and (not required or is_blind):
-        missing = [x for x in whole["imu quaternion" if required else "pose"] if x not in names]
+        forms |= {
+            "imu quaternion": ("imu", IMU[:4]), "quaternion": ("base", POSE[3:]),
+            "rpy": ("base", _ANGLES[3:]), "imu": ("imu", IMU[4:]),
+        }  # fmt: skip
+        orientations = [kind for kind in forms if kind != "imu"]
+    elif not wanted.link:
+        forms |= {"twist": ("base", TWIST), "acceleration": ("base", ACCELERATION)}
+    of_kind = {kind: [f"{start}_{end}" for end in ends] for kind, (start, ends) in forms.items()}
+    present = {kind: columns for kind, columns in of_kind.items() if set(columns) <= set(names)}
+    used = next((kind for kind in orientations if kind in present), "")
+    missing = [x for x in of_kind.get("imu", ()) if x not in names]
+    needs_pose = wanted.imu is None or wanted.needs_heading or not wanted.imu.gravity.any()
+    if not used and not missing and needs_pose:
+        missing = [x for x in of_kind.get("imu quaternion", of_kind["pose"]) if x not in names]
     if missing:
         seen = [name for name in names if name.startswith(("base_", "imu_"))]
-        what = "the IMU" if required else "the pose of the floating base"
-        remedy = _IMU_REMEDY if required else _POSE_REMEDY
+        what = "the pose of the floating base" if wanted.imu is None else "the IMU"
         raise DataError(
             f"{where} has no column {listed(missing)} of {what}; columns of the base found: "
-            f"{listed(seen)}. {remedy}",
+            f"{listed(seen)}. {_POSE_REMEDY if wanted.imu is None else _IMU_REMEDY}",
             code="missing_column",
         )
-    return {kind: own for kind, own in found.items() if kind == used or kind not in orientations}
+    return {kind: x for kind, x in present.items() if kind == used or kind not in orientations}
 
 
 def base_of(
     t: Array, q: Array, values: Mapping[str, Array], wanted: BaseColumns
 ) -> tuple[BaseMotion | None, str]:
-    """Return the motion of the base from its columns, None without these, and a note or "".
-
-    t (N,) [s], q (N, n) [rad or m], values (N, k).
-    """
+    """Return the motion of the base from its columns (N, k), None without these, and a note."""
     pose, frame = _pose_of(values, wanted.imu), wanted.imu
     if pose is None and frame is not None and "base imu" in values:
         imu, note = motion_of_imu(t, q, _checked(values["base imu"], "IMU", 6), frame)
-        pose = np.zeros((len(t), 7))
-        pose[:, 3:] = orientation_of_imu(t, imu.values, frame.gravity)
+        quaternion = orientation_of_imu(t, imu.values, frame.gravity)
         note += "; the orientation is estimated from angular velocity and specific force"
-        return BaseMotion(pose, imu=imu), note
+        return BaseMotion(np.hstack([np.zeros((len(t), 3)), quaternion]), imu=imu), note
     if pose is None:
         return None, ""
     twist, acceleration = values.get("base twist"), values.get("base acceleration")
@@ -301,7 +251,7 @@ def _pose_of(values: Mapping[str, Array], frame: ImuFrame | None) -> Array | Non
 def _radians(angles: Array) -> Array:
     """Return roll, pitch and yaw (N, 3); refuse those in degrees. Yaw may count full turns."""
     largest = float(np.abs(angles[:, :2]).max(initial=0.0))
-    if largest > _TURN:
+    if largest > 2.0 * np.pi:
         raise DataError(
             f"base_roll and base_pitch are up to {largest:.4g}, wanted at most pi: they look like "
             "degrees. Convert base_roll, base_pitch and base_yaw to rad",
@@ -313,11 +263,8 @@ def _radians(angles: Array) -> Array:
 def contacts_of(values: Array, wanted: BaseColumns, where: str) -> dict[str, Array]:
     """Return whether links touch the ground, by link, each of shape (N,), bool: values (N, k)."""
     links = wanted.contacts
-    limits = np.full(len(links), np.nan)
-    if wanted.thresholds:
-        limits[:] = [np.nan if x is None else x for x in wanted.thresholds]
-    is_force = ~np.isnan(limits)
-    values = np.where(is_force, values > limits, values)
+    limits = np.array(wanted.thresholds or [None] * len(links), dtype=float)  # None becomes NaN
+    values = np.where(np.isnan(limits), values, values > limits)
     for link, flags in zip(links, values.T, strict=True):
         wrong = np.flatnonzero((flags != 0.0) & (flags != 1.0))
         if len(wrong):
@@ -333,8 +280,7 @@ def table_of_base(
 ) -> dict[str, Array]:
     """Return the columns of a log with the motion of a base, contacts and wrenches, by name."""
     table: dict[str, Array] = {}
-    forms = {"pose": POSE, "twist": TWIST, "acceleration": ACCELERATION}
-    for kind, ends in forms.items():
+    for kind, ends in (("pose", POSE), ("twist", TWIST), ("acceleration", ACCELERATION)):
         values = getattr(base, kind, None)
         if values is not None:
             table |= {f"base_{end}": values[:, k] for k, end in enumerate(ends)}
@@ -353,7 +299,6 @@ def base_state(
 
     What was not recorded is differentiated: with the axes R of the base, v = R^T dx/dt and
     w = 2 (q* dq/dt), the vector part of the product of quaternions.
-
     t (N,) [s], pose (N, 7) [m, -], twist (N, 6), acceleration (N, 6).
     """
     quaternion = pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
@@ -375,60 +320,53 @@ def pose_jumps(t: Array, pose: Array) -> tuple[Array, Array, Array]:
 
     A step is compared with the mean of the steps before and after it, and their difference with
     those of 32 rows on each side. A change of the speed, as by an impact, is no jump.
-
     t (N,) [s], pose (N, 7) -> (k,) [m].
     """
     dt, sizes = np.diff(t), np.zeros((2, len(t)))
     if len(dt) < 3:
         return np.empty(0, dtype=int), np.empty(0), np.empty(0)
-    whole = dt < _GAP * np.median(dt)
-    whole = whole[1:-1] & whole[:-2] & whole[2:]
-    for found, values, least in zip(
+    is_regular = dt < GAP_STEPS * np.median(dt)
+    is_regular = is_regular[1:-1] & is_regular[:-2] & is_regular[2:]
+    for jumps, values, least in zip(
         sizes, (pose[:, :3], 2.0 * pose[:, 3:]), _SMALLEST, strict=True
     ):
         steps = np.diff(values, axis=0)
         size = np.linalg.norm(steps[1:-1] - 0.5 * (steps[:-2] + steps[2:]), axis=1)
         impact = np.linalg.norm(steps[2:] - steps[:-2], axis=1) > size  # a change of the speed
-        for k in np.flatnonzero(whole & ~impact & (size > least)):
+        for k in np.flatnonzero(is_regular & ~impact & (size > least)):
             beside = slice(max(k - _BESIDE, 0), k + _BESIDE + 1)
-            usual = np.percentile(size[beside][whole[beside]], _USUAL)
+            usual = np.percentile(size[beside][is_regular[beside]], _USUAL)
             if size[k] > _JUMPS * usual and size[k] == size[max(k - 1, 0) : k + 2].max():
-                found[k + 2] = size[k]
+                jumps[k + 2] = size[k]
     rows = np.flatnonzero(sizes.any(axis=0))
     return rows, *sizes[:, rows]
 
 
-def in_base(quaternion: Array, vector: Array) -> Array:
-    """Return vectors with the axes of the base, R^T x, shape (N, 3).
+def continuous_signs(q: Array) -> Array:
+    """Return the signs with which quaternions (N, 4) do not jump to their opposites, (N, 1)."""
+    is_opposite = np.sum(q[1:] * q[:-1], axis=1) < 0
+    return np.where(np.append(0, np.cumsum(is_opposite)) % 2, -1.0, 1.0)[:, None]
 
-    quaternion (N, 4), vector (N, 3).
-    """
+
+def in_base(quaternion: Array, vector: Array) -> Array:
+    """Return vectors (N, 3) with the axes of the base, R^T x: quaternion (N, 4)."""
     u = np.cross(vector, quaternion[:, :3])
-    turned: Array = vector + 2.0 * (quaternion[:, 3:] * u + np.cross(u, quaternion[:, :3]))
-    return turned
+    return np.asarray(vector + 2.0 * (quaternion[:, 3:] * u + np.cross(u, quaternion[:, :3])))
 
 
 def vector_part(p: Array, rate: Array) -> Array:
     """Return the vector part of the product p* r of quaternions x y z w, shape (N, 3)."""
     vector, scalar = p[:, :3], p[:, 3:]
-    part: Array = scalar * rate[:, :3] - rate[:, 3:] * vector - np.cross(vector, rate[:, :3])
-    return part
+    return np.asarray(scalar * rate[:, :3] - rate[:, 3:] * vector - np.cross(vector, rate[:, :3]))
 
 
 def quaternions_of_angles(angles: Array) -> Array:
-    """Return qx qy qz qw of roll, pitch and yaw, R = Rz(yaw) Ry(pitch) Rx(roll), shape (N, 4).
-
-    angles (N, 3) [rad].
-    """
+    """Return qx qy qz qw of roll, pitch, yaw (N, 3) [rad], R = Rz(yaw) Ry(pitch) Rx(roll)."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(angles.T / 2), np.sin(angles.T / 2)
-    return np.column_stack(
-        [
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-            cr * cp * cy + sr * sp * sy,
-        ]
-    )
+    return np.column_stack([
+        sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy,
+    ])  # fmt: skip
 
 
 def _checked(values: ArrayLike, name: str, width: int) -> Array:
@@ -443,12 +381,7 @@ def _checked(values: ArrayLike, name: str, width: int) -> Array:
 
 
 def motion_of_imu(t: Array, q: Array, values: Array, frame: ImuFrame) -> tuple[ImuMotion, str]:
-    """Return the motion of an IMU without the bias of its gyroscopes, and a note on the bias.
-
-    The bias is that of ``bias_at_rest``.
-
-    t (N,) [s], q (N, n) [rad or m], values (N, 6).
-    """
+    """Return the motion of an IMU (N, 6) without its gyroscopes' bias, and a note on the bias."""
     turned = np.hstack([values[:, :3] @ frame.rotation.T, values[:, 3:] @ frame.rotation.T])
     bias, note = frame.bias, ""
     if bias is None:
@@ -458,11 +391,7 @@ def motion_of_imu(t: Array, q: Array, values: Array, frame: ImuFrame) -> tuple[I
 
 
 def bias_at_rest(parts: Sequence[tuple[Array, Array, Array]]) -> tuple[Array, str]:
-    """Return the bias of gyroscopes, shape (3,) [rad/s], and a note on it.
-
-    It is the mean angular velocity in all windows of 0.5 s in which joints and gyroscopes are at
-    rest; 0 without one.
-    """
+    """Return the mean angular velocity (3,) [rad/s] in all windows of rest, or 0, and a note."""
     means = []
     for t, q, w in parts:
         number = ((t - t[0]) / _WINDOW).astype(int)
@@ -492,13 +421,9 @@ def orientation_of_imu(t: Array, values: Array, gravity: Array) -> Array:
 
     The angular velocity is integrated. With the axes that result, the mean specific force in some
     seconds is opposite to gravity, for the velocity of a robot hardly changes in them: this
-    corrects the tilt. The heading starts at 0.
-
-    References:
-        Mahony, Hamel, Pflimlin (2008), Nonlinear Complementary Filters on the Special Orthogonal
-        Group; here without delay, for the whole log is known.
-
-    t (N,) [s], values (N, 6), gravity (3,) [m/s^2].
+    corrects the tilt. The heading starts at 0. See Mahony, Hamel, Pflimlin (2008), Nonlinear
+    Complementary Filters on the Special Orthogonal Group; here without delay, for the whole log is
+    known. t (N,) [s], values (N, 6), gravity (3,) [m/s^2].
     """
     parts = np.split(np.arange(len(t)), np.flatnonzero(np.diff(t) > _BREAK) + 1)
     return np.concatenate([_levelled(t[k], values[k], -gravity) for k in parts])
@@ -526,8 +451,8 @@ def _mean(t: Array, x: Array) -> Array:
     first, last = (np.clip(t + side * _LEVEL / 2, t[0], t[-1]) for side in (-1, 1))
     for _ in range(2):
         areas = 0.5 * np.diff(t)[:, None] * (x[1:] + x[:-1])
-        whole = np.vstack([np.zeros(x.shape[1]), np.cumsum(areas, axis=0)])
-        ends = [np.stack([np.interp(at, t, y) for y in whole.T], axis=1) for at in (first, last)]
+        integral = np.vstack([np.zeros(x.shape[1]), np.cumsum(areas, axis=0)])
+        ends = [np.stack([np.interp(at, t, y) for y in integral.T], axis=1) for at in (first, last)]
         x = (ends[1] - ends[0]) / (last - first)[:, None]
     return x
 
@@ -556,7 +481,6 @@ def inertial_state(
 
     With the lever r of the IMU, its specific force f without bias and gravity g, the specific
     force at the origin is f - alpha x r - w x (w x r), and dv/dt = that + g - w x v.
-
     t (N,) [s], velocity (N, 3) [m/s], down (N, 3) [m/s^2].
     """
     w, f, r = values[:, :3], values[:, 3:], frame.lever

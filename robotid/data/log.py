@@ -41,6 +41,12 @@ _BY_SAMPLE = (
 )  # fmt: skip
 _LARGEST = 1e30  # in any unit, so that squares and products are finite
 _BLOCK = 2**17  # stamps processed together
+#: Share of the instants of a motion in another one, from which it repeats that.
+REPEATED = 0.3
+_AHEAD = (0.0, 0.25, 0.5, 0.75, 1.0)  # [s] after an instant, positions that are compared
+_NEAR = 0.02  # of the range of each joint: closer positions are equal
+_INSTANTS = 300
+_FEW = 60  # ... of each of many motions
 
 
 @dataclass(frozen=True, eq=False)
@@ -375,10 +381,10 @@ def _names(joints: object, where: str) -> tuple[str, ...]:
     """Return the names of joints as a tuple."""
     names = joints.tolist() if isinstance(joints, np.ndarray) else joints
     is_list = isinstance(names, Iterable) and not isinstance(names, str | Mapping)
-    found: tuple[Any, ...] = tuple(names) if is_list else ()  # type: ignore[arg-type]
-    if not found or not all(isinstance(name, str) for name in found):
+    labels: tuple[Any, ...] = tuple(names) if is_list else ()  # type: ignore[arg-type]
+    if not labels or not all(isinstance(name, str) for name in labels):
         raise DataError(f"{where}: joints is {joints!r}, wanted at least one name in a tuple")
-    return found
+    return labels
 
 
 def require_finite(
@@ -471,10 +477,7 @@ def blocks_of(t: Array) -> Iterator[tuple[int, Array]]:
 
 
 def median_step(t: Array) -> float:
-    """Return the median time step [s]; those of a long log are sorted in a temporary file.
-
-    t (N,) [s].
-    """
+    """Return the median time step [s] of stamps (N,); those of a long log are sorted in a file."""
     if len(t) <= _BLOCK:
         return float(np.median(np.diff(t)))
     with tempfile.TemporaryFile() as file:
@@ -482,3 +485,59 @@ def median_step(t: Array) -> float:
         for row, block in blocks_of(t):
             steps[row : row + len(block) - 1] = np.diff(block)
         return float(np.median(steps, overwrite_input=True))
+
+
+def repeated_share(fitted: Sequence[Trajectory], validation: Trajectory) -> float:
+    """Return the largest share of a motion that is in one of others."""
+    size = np.maximum(np.ptp(validation.q, axis=0), 1e-3)
+    instants = _segments(validation, size, _INSTANTS)
+    return max((_share(instants, _segments_tree(motion, size)) for motion in fitted), default=0.0)
+
+
+def alike_motions(motions: Sequence[Trajectory]) -> list[list[int]]:
+    """Return the motions in groups: one that repeats another one is in its group."""
+    low, high = (np.array([f(x.q, axis=0) for x in motions]) for f in (np.min, np.max))
+    size = np.maximum(high.max(axis=0) - low.min(axis=0), 1e-3)
+    trees = [_segments_tree(motion, size) for motion in motions]
+    groups: list[list[int]] = []
+    for k, motion in enumerate(motions):
+        instants = _segments(motion, size, _FEW)
+        same = [x for x in groups if any(_share(instants, trees[j]) >= REPEATED for j in x)]
+        groups = [group for group in groups if group not in same]
+        groups.append([*(j for group in same for j in group), k])
+    return sorted(sorted(group) for group in groups)
+
+
+def _segments_tree(motion: Trajectory, size: Array) -> Any:  # noqa: ANN401
+    """Return the tree of all segments of a motion; None without any."""
+    from scipy.spatial import cKDTree
+
+    segments = _segments(motion, size, None)
+    return cKDTree(segments) if len(segments) else None
+
+
+def _share(instants: Array, tree: Any) -> float:  # noqa: ANN401
+    """Return the share of instants that are near one of a tree."""
+    if tree is None or not len(instants):
+        return 0.0
+    distance, _ = tree.query(instants, p=np.inf, distance_upper_bound=_NEAR)
+    return float(np.mean(np.isfinite(distance)))
+
+
+def _segments(motion: Trajectory, size: Array, count: int | None) -> Array:
+    """Return positions at instants and up to a second after, over the size, where joints move."""
+    step = float(np.median(np.diff(motion.t)))
+    ahead = [round(s / step) for s in _AHEAD]
+    last = len(motion.t) - ahead[-1]
+    if last <= 0:
+        return np.empty((0, len(_AHEAD) * len(size)))
+    starts = np.arange(last)
+    is_unbroken = motion.segment[starts] == motion.segment[starts + ahead[-1]]
+    moved = np.abs(motion.q[starts + ahead[-1]] - motion.q[starts]) / size
+    starts = starts[is_unbroken & (moved.max(axis=1) > 2 * _NEAR)]
+    if count is not None and len(starts) > count:
+        starts = starts[np.linspace(0, len(starts) - 1, count).astype(int)]
+    else:
+        # instants so close that fast motion moves less than the bound between two of them
+        starts = starts[:: max(1, round(0.005 / step))]
+    return np.hstack([motion.q[starts + k] / size for k in ahead])

@@ -10,26 +10,25 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
-from math import factorial
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.polynomial.polynomial import polyder, polyval
 from scipy.linalg.lapack import dtbtrs
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.text import seconds
 from robotid.base.typing import Array
-from robotid.data.base_motion import base_state, pose_jumps
+from robotid.data.base_motion import GAP_STEPS, base_state, pose_jumps
 from robotid.data.log import Log, Trajectory
-from robotid.data.measured_velocity import is_trustworthy
 from robotid.data.signal_settings import SignalSettings
+from robotid.data.units import is_trustworthy
 
 _SLOWEST = 1e-6  # smallest cut-off over the rate
-_GAP_STEPS = 2.5  # [median steps] a longer step may be a gap
 _UNWRAPPED: WeakKeyDictionary[Log, Log] = WeakKeyDictionary()
-_GAP_CYCLES = 0.25  # [periods of the filter] ... if it is also longer than this
+_GAP_CYCLES = 0.25  # [periods of the filter] shortest gap, if it is longer than ``GAP_STEPS``
 #: Rows after which the end of a cubic spline has no effect: it decreases by half or more per row.
 SPLINE = 64
 _SETTLED = 42.0  # [time constants] after which a filter's transient is negligible: 6e-19
@@ -102,7 +101,7 @@ def decide(
         acceleration = "measured" if is_used else "differentiated"
     gap = settings.max_gap
     if gap is None:
-        gap = max(_GAP_STEPS * step, _GAP_CYCLES / cutoff if cutoff else 0.0)
+        gap = max(GAP_STEPS * step, _GAP_CYCLES / cutoff if cutoff else 0.0)
     return replace(settings, rate=rate, velocity=velocity, acceleration=acceleration, max_gap=gap)
 
 
@@ -183,7 +182,6 @@ def process_segments(
 
     The result for a part equals that for the whole, if the log has the rows of its segments
     within ``filter_reach`` of the part.
-
     speeds (c, n).
     """
     is_sharp = settings.cutoff is None and settings.friction_band == 0
@@ -258,10 +256,7 @@ def _time_constant(settings: SignalSettings) -> float:
 
 
 def low_pass(values: Array, rate: float, settings: SignalSettings) -> Array:
-    """Return values after the zero-phase Butterworth filter, same shape; unchanged without one.
-
-    values (N, ...).
-    """
+    """Return values (N, ...) after the zero-phase Butterworth filter, if the settings have one."""
     if settings.cutoff is None or len(values) < 2:
         return values
     pad = min(len(values) - 1, int(2 * rate / settings.cutoff))  # two periods
@@ -385,10 +380,7 @@ def _jumping(stamps: Array, pose: Array, t: Array, settings: SignalSettings) -> 
 
 @dataclass(frozen=True)
 class _Grid:
-    """The ``count`` times at which a segment is filtered, and the decimation afterwards.
-
-    Without a step, they are the rows of the log.
-    """
+    """The times at which a segment is filtered, and the decimation; no step: the log's rows."""
 
     start: float
     last: float
@@ -420,8 +412,7 @@ class _Grid:
 
     def at(self, numbers: Array) -> Array:
         """Return the times of some points."""
-        times: Array = self.start + (self.step or 0.0) * numbers
-        return times
+        return self.start + (self.step or 0.0) * numbers
 
     def number_of(self, t: float) -> int:
         """Return the first point that is not before t."""
@@ -439,8 +430,7 @@ class _Grid:
 def _acting(t: Array, w: Array, settings: SignalSettings) -> Array:
     """Return the direction of Coulomb friction, before any filter."""
     if settings.friction_band > 0:
-        linear: Array = np.clip(w / settings.friction_band, -1.0, 1.0)
-        return linear
+        return np.clip(w / settings.friction_band, -1.0, 1.0)
     longest = _LONGEST / (settings.cutoff or np.inf)
     return acting_directions(t, w, settings.min_velocity, longest)
 
@@ -452,8 +442,7 @@ def _resample(t: Array, values: Array, grid: Array) -> Array:
     from scipy.interpolate import CubicSpline  # takes long to import
 
     # a channel with a delay is constant beyond its ends
-    smooth: Array = CubicSpline(t, values)(np.clip(grid, t[0], t[-1]))
-    return smooth
+    return np.asarray(CubicSpline(t, values)(np.clip(grid, t[0], t[-1])))
 
 
 def acting_directions(t: Array, w: Array, band: float, longest: float) -> Array:
@@ -462,13 +451,10 @@ def acting_directions(t: Array, w: Array, band: float, longest: float) -> Array:
     It is the sign of the speed. In stiction, a drive stops abruptly and moves again later: its
     friction balances the applied torque, from one bound to the other, while the filtered speed
     oscillates about zero. There the direction changes linearly in time from the sign before to the
-    sign after. A drive was in stiction if it was in the band longer than the slopes at the edges
-    of the band indicate: by a factor of two if it reverses, of four if it does not.
-
-    References:
-        Karnopp (1985), Computer simulation of stick-slip friction in mechanical dynamic systems.
-
-    t (N,) [s], w (N, c) [rad/s].
+    sign after. A drive was in stiction if it was in the band longer than the slopes at the edges of
+    the band indicate: by a factor of two if it reverses, of four if it does not. See Karnopp
+    (1985), Computer simulation of stick-slip friction in mechanical dynamic systems. t (N,) [s], w
+    (N, c) [rad/s].
     """
     directions = np.where(np.abs(w) < _REST, 0.0, np.sign(w))
     for x, direction in zip(w.T, directions.T, strict=True):
@@ -502,7 +488,6 @@ def standing_motion(
     is too fast, or is accelerated or decelerated too much, are left out. Consecutive blocks at rest
     are joined: each pose at rest is one sample. There is no filter and no derivative: the speed is
     the slope of the positions over the block, and 0 for a single row.
-
     least (n,) [rad/s or m/s], fastest (n,), hardest (n,) [rad/s^2 or m/s^2] -> (K,).
     """
     of_block, segment = _blocks(log.t, max_gap)
@@ -559,8 +544,7 @@ def _blocks(t: Array, max_gap: float) -> tuple[Array, Array]:
 
 def _means(values: Array, first: Array, total: Array) -> Array:
     """Return sums of the rows of each block, over the totals."""
-    means: Array = (np.add.reduceat(values, first).T / total).T
-    return means
+    return (np.add.reduceat(values, first).T / total).T
 
 
 # The filters equal sosfiltfilt and savgol_filter of scipy.signal, whose import takes longer than
@@ -569,10 +553,7 @@ def _means(values: Array, first: Array, total: Array) -> Array:
 
 @cache  # a log has few filters, each for many channels
 def butterworth_poles(order: int, cutoff: float, rate: float) -> Array:
-    """Return the poles of a digital Butterworth low-pass filter, by the bilinear transform.
-
-    -> (ceil(order / 2),).
-    """
+    """Return the ceil(order / 2) poles of a Butterworth low-pass, by the bilinear transform."""
     angles = np.pi * (2 * np.arange((order + 1) // 2) + order + 1) / (2 * order)
     analog = np.tan(np.pi * cutoff / rate) * np.exp(1j * angles)
     poles = np.asarray((1 + analog) / (1 - analog))
@@ -585,7 +566,6 @@ def zero_phase(x: Array, order: int, cutoff: float, rate: float, pad: int) -> Ar
 
     The initial state of each pass is the steady state for the first value; both ends are extended
     by point reflection of the signal (Gustafsson 1996 compares such initial states).
-
     x (N, ...).
     """
     if not x.size:
@@ -631,22 +611,18 @@ def local_polynomial(
 
     At the ends the polynomial of the first and of the last ``width`` rows is used (Savitzky, Golay
     1964).
-
     x (N, ...).
     """
     half = width // 2
     offsets = np.arange(-half, half + 1)
     fit = np.linalg.pinv(np.vander(offsets, degree + 1, increasing=True))  # (degree + 1, width)
-    scale = factorial(derivative) / step**derivative
-    inner = sliding_window_view(x, width, axis=0) @ (scale * fit[derivative])
-    powers = np.arange(degree + 1 - derivative)
-    slopes = [factorial(k + derivative) / factorial(k) / step**derivative for k in powers]
+    terms = polyder(np.eye(degree + 1), derivative, 1 / step)
 
-    def end(rows: Array, at: Array) -> Array:
-        """Return the values at some offsets by the polynomial of ``width`` rows."""
-        coefficients = np.tensordot(fit[derivative:], rows, axes=1)
-        return np.tensordot(at[:, None] ** powers * slopes, coefficients, axes=1)
+    def weights(at: Array) -> Array:
+        """Return those of the rows in the values at some offsets, shape (k, width)."""
+        return np.asarray(polyval(at, terms).T @ fit)
 
-    return np.concatenate(
-        [end(x[:width], offsets[:half]), inner, end(x[-width:], offsets[half + 1 :])]
-    )
+    inner = sliding_window_view(x, width, axis=0) @ weights(offsets[half : half + 1])[0]
+    first = np.tensordot(weights(offsets[:half]), x[:width], axes=1)
+    last = np.tensordot(weights(offsets[half + 1 :]), x[-width:], axes=1)
+    return np.concatenate([first, inner, last])

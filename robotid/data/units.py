@@ -1,6 +1,12 @@
-"""Units of a log: stated by the user, or checked; never guessed."""
+"""Units and measured velocities of a log, checked against its positions.
 
-from collections.abc import Collection, Sequence
+Units are stated by the user, or checked; never guessed.
+"""
+
+from collections.abc import Callable, Collection, Sequence
+from functools import wraps
+from typing import TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,16 +18,24 @@ from robotid.data.log import Log
 from robotid.data.signal_settings import PER_SECOND, LogUnits
 
 _TIME_NAMES = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
-_DEGREES = 180 / np.pi  # degrees in a radian
 _EPOCHS = 6e8, 5e9  # [s] since 1970: dates from 1989 to 2128
 _SLOWEST = 0.1  # [s] a longer median step has another unit
 _FARTHEST = 4 * np.pi  # [rad] a joint beyond two revolutions is in degrees
 _FREE = 10 * np.pi  # [rad] ... one without limits beyond five: pendulums were recorded over 4.5
-_USUAL = 2 * np.pi  # [rad] ... and one within a revolution is in radians if others are farther
+#: [s] Largest lag of a measured velocity that "auto" uses.
+LARGEST_LAG = 0.02
+#: Least number of steps over the range of a channel with sufficient resolution.
+COARSE = 100
+_FEWEST = 8  # least number of rows of a segment in which a lag is estimated
+_LONGEST = 0.3  # [s] largest lag that is tested
+_UNLIKE = 0.5  # correlation below which a velocity is not the derivative of its position
+_MOVED, _SPEED = 1e-3, 0.02  # [rad or m], [rad/s or m/s] smaller values: at rest
 _SEGMENT = 0.1  # [s] over which the motion is averaged against noise and jitter
 _GAP = 5  # [median steps] a longer step is a gap
 _ALIKE = 0.9  # correlation from which two signals are proportional
 _NEAR = 0.1  # relative tolerance of the factor between them
+
+ResultT = TypeVar("ResultT")
 
 
 def check_units(
@@ -102,10 +116,7 @@ def check_reach(
 
 
 def turned(joints: Sequence[str], q: Array, turning: Collection[str]) -> tuple[str, ...]:
-    """Return what is assumed of joints without limits beyond the angles that others may reach.
-
-    q (N, n).
-    """
+    """Return what is assumed of joints without limits that turn farther than others: q (N, n)."""
     far = [name for name, x in zip(joints, q.T, strict=True)
            if name in turning and np.abs(x).max() > _FARTHEST]  # fmt: skip
     if not far:
@@ -118,10 +129,10 @@ def turned(joints: Sequence[str], q: Array, turning: Collection[str]) -> tuple[s
 
 def _alone(log: Log, kind: str, j: int, others: Array) -> str:
     """Return how to convert one joint that alone looks like degrees, as text; else ""."""
-    if len(others) < 2 or others.max() > _USUAL:
+    if len(others) < 2 or others.max() > _FARTHEST / 2:
         return ""
     kinds = [kind]
-    if kind == "q" and not _is_near(np.abs(_velocity_factor(log)), 1 / _DEGREES)[j]:
+    if kind == "q" and not _is_near(np.abs(_velocity_factor(log)), np.radians(1.0))[j]:
         kinds += [name for name, values in (("dq", log.v), ("ddq", log.a)) if values is not None]
     if kind == "q" and log.q_ref is not None and np.abs(log.q_ref[:, j]).max() > _FARTHEST:
         kinds.append("qref")
@@ -144,7 +155,7 @@ def _check_commands(log: Log, is_revolute: Array) -> None:
     follows = is_revolute & (np.abs(both) > _ALIKE * sizes[0] * sizes[1])
     factor = np.copysign(sizes[1], both) / np.where(follows, sizes[0], np.nan)
     ratio = np.abs(factor)
-    for j in np.flatnonzero(_is_near(ratio, _DEGREES) | _is_near(ratio, 1 / _DEGREES)):
+    for j in np.flatnonzero(_is_near(ratio, np.degrees(1.0)) | _is_near(ratio, np.radians(1.0))):
         raise DataError(
             f"{log.name}: the motion of qref_{log.joints[j]} is {factor[j]:.3g} times that of "
             f"q_{log.joints[j]}: one of them looks like degrees, the other like radians. Convert "
@@ -155,7 +166,7 @@ def _check_commands(log: Log, is_revolute: Array) -> None:
 
 def _check_degrees(log: Log, factor: Array) -> None:
     """Reject joints with only one of position and velocity in degrees."""
-    for wrong, ratio in (("velocity", _DEGREES), ("position", 1 / _DEGREES)):
+    for wrong, ratio in (("velocity", np.degrees(1.0)), ("position", np.radians(1.0))):
         for j in np.flatnonzero(_is_near(np.abs(factor), ratio)):
             raise DataError(
                 f"{log.name}: dq_{log.joints[j]} is {abs(factor[j]):.3g} times d(q)/dt: the "
@@ -180,33 +191,161 @@ def _how_to_state(kind: str, unit: str, si: str, both: bool = False) -> str:
 
 def _velocity_factor(log: Log) -> Array:
     """Return f with dq = f d(q)/dt for each joint, shape (n,); NaN if they do not correlate."""
-    factor = np.full(len(log.joints), np.nan)
-    if log.v is None:
-        return factor
-    dt = np.diff(log.t)
+    if log.v is None or len(log.t) <= 10:
+        return np.full(len(log.joints), np.nan)
+    moved, integral = _displacements(log, log.v)
+    both, *squares = (np.sum(x * y, axis=0) for x, y in (
+        (moved, integral), (moved, moved), (integral, integral)
+    ))  # fmt: skip
+    follows = np.abs(both) > _ALIKE * np.sqrt(squares[0] * squares[1])
+    factor = np.sqrt(squares[1] / np.where(follows, squares[0], np.nan))
+    return np.asarray(np.copysign(factor, both))
+
+
+def _displacements(log: Log, v: Array) -> tuple[Array, Array]:
+    """Return displacements over short segments by positions and by speeds, (K, n), but jumps."""
+    dt, step = np.diff(log.t)[:, None], np.diff(log.q, axis=0)
     median = float(np.median(dt))
     length = int(np.clip(round(_SEGMENT / median), 1, max(1, len(dt) // 4)))
-    for j, (q, v) in enumerate(zip(log.q.T, log.v.T, strict=True)):
-        step = np.diff(q)
-        jump = _is_near(np.abs(step), 2 * np.pi) | _is_near(np.abs(step), 360.0)  # a full turn
-        broken = (dt > _GAP * median) | jump
-        moved = _sums(np.where(broken, 0.0, step), length)
-        integral = _sums(np.where(broken, 0.0, dt * (v[1:] + v[:-1]) / 2), length)
-        both = float(moved @ integral)
-        size = float(np.sqrt((moved @ moved) * (integral @ integral)))
-        if len(dt) >= 10 and abs(both) > _ALIKE * size:
-            factor[j] = np.copysign(np.sqrt((integral @ integral) / (moved @ moved)), both)
-    return factor
-
-
-def _sums(steps: Array, length: int) -> Array:
-    """Return the sums over each segment of ``length`` consecutive steps."""
-    total = np.concatenate([[0.0], np.cumsum(steps)])
-    sums: Array = total[length:] - total[:-length]
-    return sums
+    jump = _is_near(np.abs(step), 2 * np.pi) | _is_near(np.abs(step), 360.0)
+    used = (dt <= _GAP * median) & ~jump
+    totals = (np.cumsum(np.vstack([0.0 * x[:1], used * x]), axis=0)
+              for x in (step, dt * (v[1:] + v[:-1]) / 2))  # fmt: skip
+    moved, integral = (total[length:] - total[:-length] for total in totals)
+    return moved, integral
 
 
 def _is_near(values: Array, wanted: float) -> NDArray[np.bool_]:
     """Return which values are within the tolerance of the wanted one."""
     near: NDArray[np.bool_] = np.abs(values / wanted - 1) < _NEAR
     return near
+
+
+def _once(check: Callable[[Log], ResultT]) -> Callable[[Log], ResultT]:
+    """Keep the result of a check with each log: the doctor and the fit both use it."""
+    known: WeakKeyDictionary[Log, ResultT] = WeakKeyDictionary()
+
+    @wraps(check)
+    def result(log: Log) -> ResultT:
+        if log not in known:
+            known[log] = check(log)
+        return known[log]
+
+    return result
+
+
+def is_trustworthy(log: Log, stated: float = 0.0) -> bool:
+    """Return whether velocities have a small lag, resolution, and follow from their positions."""
+    return is_timely(log, stated) and not coarse_velocities(log) and not unlike_velocities(log)
+
+
+def is_timely(log: Log, stated: float = 0.0) -> bool:
+    """Return whether the measured velocities lag their positions by less than 20 ms."""
+    return velocity_lags(log)[0] - stated < LARGEST_LAG
+
+
+@_once
+def velocity_lags(log: Log) -> tuple[float, Array]:
+    """Return the delays of measured velocities relative to the derivatives of the positions [s].
+
+    The delay minimises the distance between the measured velocity and the delayed derivative. It is
+    found on a uniform grid in segments without gaps and refined by a parabola. It is positive if
+    the measured velocity lags, and 0 if the joints are at rest.
+    -> (n,).
+    """
+    v = _measured(log)
+    step = float(np.median(np.diff(log.t)))
+    q = np.unwrap(log.q, axis=0)
+    parts = np.split(np.arange(len(log.t)), np.flatnonzero(np.diff(log.t) > _GAP * step) + 1)
+    longest = min(int(_LONGEST / step) + 1, max(map(len, parts)) // 4)
+    shifts = np.arange(-longest, longest + 1)
+    total = np.zeros((len(log.joints), len(shifts)))
+    for part in (rows for rows in parts if len(rows) >= max(4 * longest, _FEWEST)):
+        t = log.t[part]
+        grid = np.arange(t[0], t[-1], step)
+        for own, x, measured in zip(total, q[part].T, v[part].T, strict=True):
+            slope = np.gradient(np.interp(grid, t, x), step)
+            own += len(grid) * _distances(slope, np.interp(grid, t, measured), longest)
+
+    def delay(total: Array) -> float:
+        best = int(np.argmin(total))
+        if not 0 < best < len(shifts) - 1:
+            return 0.0
+        left, middle, right = total[best - 1 : best + 2]
+        curvature = left - 2 * middle + right
+        fraction = 0.5 * (left - right) / curvature if curvature > 0 else 0.0
+        return float((shifts[best] + fraction) * step)
+
+    single = [delay(own) if x.any() else 0.0 for own, x in zip(total, v.T, strict=True)]
+    return delay(total.sum(axis=0)) if v.any() else 0.0, np.array(single)
+
+
+@_once
+def coarse_velocities(log: Log) -> tuple[str, ...]:
+    """Return the joints whose measured velocity is coarsely quantised, as from an encoder."""
+    return tuple(
+        joint
+        for joint, x in zip(log.joints, _measured(log).T, strict=True)
+        if 0 < np.ptp(x) < COARSE * quantum(x)
+    )
+
+
+@_once
+def unlike_velocities(log: Log) -> dict[str, float]:
+    """Joints whose measured velocity is not the derivative of their position at any lag."""
+    v, dt = _measured(log), np.diff(log.t)
+    moved, integral = _displacements(log, v)
+    length, median = len(dt) - len(moved) + 1, float(np.median(dt))
+    last = min(round(_LONGEST / median), len(moved) // 2)
+    shifts = [k for k in range(-last, last + 1, max(length // 2, 1)) if abs(k) < len(moved) // 2]
+    unlike = {}
+    for j, joint in enumerate(log.joints):
+        speed = float(np.sqrt(np.mean(moved[:, j] ** 2))) / (length * median)
+        if np.ptp(log.q[:, j]) < _MOVED or speed < _SPEED or np.ptp(v[:, j]) == 0:
+            continue
+        largest = max(_correlation(moved[:, j], integral[:, j], k) for k in [0, *shifts])
+        if largest < _UNLIKE:
+            unlike[joint] = largest
+    return unlike
+
+
+def quantum(x: Array, *, repeats: bool = True) -> float:
+    """Return the quantisation step of a channel, 0 if it is not quantised: x (N,)."""
+    levels = np.unique(x)
+    if len(levels) < 3 or (repeats and len(levels) > 0.5 * len(x)):
+        return 0.0
+    steps = np.diff(levels)
+    steps = steps[steps > 1e-9 * np.ptp(x)]
+    if len(steps) == 0:
+        return 0.0
+    smallest = float(np.quantile(steps, 0.1))
+    counts = np.diff(levels)[:1000] / smallest
+    return smallest if np.mean(np.abs(counts - np.round(counts)) < 0.02) > 0.95 else 0.0
+
+
+def _measured(log: Log) -> Array:
+    if log.v is None:
+        raise DataError(f"{log.path or 'log'} has no measured velocity")
+    return log.v
+
+
+def _correlation(moved: Array, integral: Array, shift: int) -> float:
+    """Return the absolute correlation of one signal with the other shifted by some rows."""
+    n = len(moved)
+    a = moved[max(-shift, 0) : n - max(shift, 0)]
+    b = integral[max(shift, 0) : n + min(shift, 0)]  # not centred: the speed may be constant
+    size = float(np.sqrt((a @ a) * (b @ b)))
+    return abs(float(a @ b)) / size if size > 0 else 0.0
+
+
+def _distances(slope: Array, v: Array, longest: int) -> Array:
+    """Return the mean squares of v - slope delayed by -longest to longest samples."""
+    n, size = len(v), 1 << (len(v) + longest).bit_length()  # of the transform, without overlap
+    spectrum = np.fft.rfft(v, size) * np.fft.rfft(slope, size).conj()
+    products = np.fft.irfft(spectrum, size)[np.arange(-longest, longest + 1)]
+    of_v, of_slope = (np.append(0.0, np.cumsum(x**2)) for x in (v, slope))  # of the first rows
+    k = np.arange(longest + 1)
+    lag = of_v[n] - of_v[k] + of_slope[n - k]  # squares of the rows compared at a lag of k
+    lead = of_v[n - k] + of_slope[n] - of_slope[k]
+    squares = np.concatenate([lead[:0:-1], lag])
+    return np.asarray((squares - 2 * products) / (n - np.abs(np.arange(-longest, longest + 1))))

@@ -15,7 +15,7 @@ from robotid.base.files import write_text
 from robotid.base.settings import SIZE, Range, Settings, setting
 from robotid.base.text import yaml_name
 from robotid.base.typing import Array
-from robotid.data.files.formats import check_suffix, write_columns
+from robotid.data.files.read import check_suffix, write_columns
 from robotid.dynamics.simulation.motions import Motion
 
 #: Kinds of motion from posture to posture.

@@ -9,8 +9,8 @@ import scipy.linalg
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.typing import Array
 from robotid.dynamics.base_parameters import BaseMapping
-from robotid.dynamics.compiled import Tree, flatten, own_motion, row_lanes, why_not
-from robotid.dynamics.drive_columns import drive_motion
+from robotid.dynamics.compiled import Tree, flatten, own_motion, tree_lanes, why_not
+from robotid.dynamics.rows import drive_motion
 from robotid.robot.drive_term import DriveMotion, DriveTerm
 from robotid.robot.model import RobotModel
 
@@ -44,7 +44,7 @@ class MotionRegressor:
 
     def __call__(self, q: Array, v: Array, a: Array) -> Array:
         """Return the columns at N samples, shape (n, b, N)."""
-        N, lanes = len(q), row_lanes()
+        N, lanes = len(q), tree_lanes()
         block = lanes.LANES
         out = np.zeros((self._shape[0] * self._shape[1], -(-N // block) * block))
         motion = own_motion(q, v, a)
@@ -55,7 +55,7 @@ class MotionRegressor:
         """Return the gradient of sum(weights * columns) by q, v and a, shape (3, N, n)."""
         by_column = np.array(weights.reshape(-1, len(q)), order="C")
         motion, out = own_motion(q, v, a), np.zeros((3, *q.shape))
-        row_lanes().pull_rows(self._tree, self._places, motion, by_column, self._work, out)
+        tree_lanes().pull_rows(self._tree, self._places, motion, by_column, self._work, out)
         return out
 
 
@@ -71,7 +71,7 @@ class Placements:
         """Return the poses of the bodies: q (N, n) [rad, m]."""
         R = np.empty((3, 3, len(tree.parents), len(q)))
         p = np.empty(R.shape[1:])
-        row_lanes().placements(tree, np.array(q, order="C"), tree.work_space(), R, p)
+        tree_lanes().placements(tree, np.array(q, order="C"), tree.work_space(), R, p)
         return cls(R, p)
 
 

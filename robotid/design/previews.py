@@ -34,7 +34,7 @@ from robotid.diagnosis.logs.check_logs import excitation_finding
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.factors import Factors, compress, join, merge
 from robotid.dynamics.prediction import predict, predict_instants
-from robotid.dynamics.used_rows import base_problem, independent_share
+from robotid.dynamics.prepared_logs import base_problem, independent_share
 from robotid.estimation.estimators import Estimate
 from robotid.estimation.estimators.batch import solve_factor
 from robotid.estimation.estimators.determination import base_spread, determine

@@ -78,11 +78,11 @@ def sentence_of(code: str, **values: float | str) -> str:
     return finding(code, **values).message
 
 
-def reason_of(found: Finding) -> str:
+def reason_of(one: Finding) -> str:
     """Return the reason of a verdict for a warning: without joint and log."""
-    entry = entries()[found.code]
+    entry = entries()[one.code]
     if entry["verdict"] is True:
-        return found.message
-    return found.reworded(
+        return one.message
+    return one.reworded(
         log="", fault=entry["verdict"].replace("{term}", entry.get("term", "")), remedy=""
     ).message

@@ -5,7 +5,6 @@ are combinations of the independent ones, W_2 = W_1 R1^-1 R2, and W pi = W_1 bet
 beta = K pi = pi_1 + R1^-1 R2 pi_2 (Gautier 1991).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -56,16 +55,6 @@ class BaseMapping:
         """Names of the standard parameters that affect no torque in any motion."""
         return tuple(self.names[i] for i in np.flatnonzero(~self.K.any(axis=0)))
 
-    def described(self, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
-        """Return how some standard parameters are structurally identifiable."""
-        terms = np.abs(self.K) > 0
-        kinds: dict[str, tuple[str, ...]] = {"alone": (), "in sums": (), "never": ()}
-        for name in names:
-            rows = terms[terms[:, self.names.index(name)]]  # that it is in
-            kind = "never" if not len(rows) else "alone" if rows.sum() == 1 else "in sums"
-            kinds[kind] += (name,)
-        return kinds
-
     def to_base(self, pi: Array) -> Array:
         """Return the base parameters beta = K pi, shape (b,): pi (p,)."""
         if pi.shape != (self.K.shape[1],):
@@ -73,22 +62,17 @@ class BaseMapping:
         return self.K @ pi
 
     def to_standard(self, beta: Array, prior: Array, spread: Array | None = None) -> Array:
-        """Return the standard parameters nearest to a prior that have these base parameters.
-
-        Nearest in units of the spread: pi = prior + G (beta - K prior), G of ``gain``.
-        """
+        """Return pi = prior + G (beta - K prior), the nearest to a prior in units of the spread."""
         if beta.shape != (len(self.K),):
             raise DataError(f"beta has shape {beta.shape}, wanted ({len(self.K)},)")
-        pi: Array = prior + self.gain(spread) @ (beta - self.to_base(prior))
-        return pi
+        return np.asarray(prior + self.gain(spread) @ (beta - self.to_base(prior)))
 
     def gain(self, spread: Array | None = None) -> Array:
         """Return G = S^2 K^T (K S^2 K^T)^-1, shape (p, b), S = diag(spread): d pi / d beta."""
         s = np.ones(self.K.shape[1]) if spread is None else spread
         # K S = (Q R)^T, so that S (K S)^+ = S Q R^-T has no loss of digits
         Q, R = scipy.linalg.qr((self.K * s).T, mode="economic")
-        gain: Array = s[:, None] * scipy.linalg.solve_triangular(R, Q.T).T
-        return gain
+        return np.asarray(s[:, None] * scipy.linalg.solve_triangular(R, Q.T).T)
 
     def reduce(self, problem: Problem) -> Problem:
         """Return the problem in the b base parameters, W_b beta = tau."""
@@ -111,10 +95,8 @@ def base_mapping(
     """Return the base parameters of a regressor taken at random states.
 
     The columns are compared after multiplication by ``scales``, physical magnitudes. They are not
-    normalised, since a column of rounding errors would become a parameter.
-
-    References:
-        Gautier (1991), Numerical calculation of the base inertial parameters of robots.
+    normalised, since a column of rounding errors would become a parameter. See Gautier (1991),
+    Numerical calculation of the base inertial parameters of robots.
     """
     if W.ndim != 2 or W.shape[1] != len(names) or len(W) < len(names):
         raise DataError(f"W has shape {W.shape}, wanted at least {len(names)} rows of {len(names)}")

@@ -1,24 +1,18 @@
-"""The compiled path to the inertial columns of the regressor.
+"""A robot's tree as arrays for compiled code.
 
-A robot's tree is flattened to arrays for ``lanes``. Any joint's placement is
-R(q) = A + B cos q + C sin q, p(q) = p0 + d q, with the axis from Pinocchio's own joint, so that
-revolute and prismatic joints, aligned or not, are one case.
+Any joint's placement is R(q) = A + B cos q + C sin q, p(q) = p0 + d q, with the axis from
+Pinocchio's own joint, so that revolute and prismatic joints, aligned or not, are one case.
 """
 
 from functools import cache
 from types import ModuleType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from robotid.base.typing import Array
-from robotid.data.base_motion import in_base
-from robotid.data.log import Trajectory
-from robotid.dynamics.drive_columns import RowPlan
-
-if TYPE_CHECKING:
-    from robotid.robot.model import RobotModel
+from robotid.robot.model import RobotModel
 
 #: Work, samples times ``work_per_sample``, from which the compiled path is faster despite its start
 #: of about 0.5 s per process (importing Numba, reading the compiled code). For seven joints in
@@ -26,19 +20,21 @@ if TYPE_CHECKING:
 LONG_ENOUGH = 3_500_000
 
 
-def work_per_sample(model: "RobotModel") -> int:
+def work_per_sample(model: RobotModel) -> int:
     """Return the work of one sample: pairs of a body and a joint that moves it, plus a constant."""
     return 8 + sum(len(support) - 1 for support in model.pin_model.supports[1:])
 
 
-def why_not(model: "RobotModel") -> str | None:
+def why_not(model: RobotModel) -> str | None:
     """Return why the compiled path does not support a robot, or None if it does."""
     joints, first = list(model.pin_model.joints), 2 if model.free_flyer else 1
     for name, joint in list(zip(model.pin_model.names, joints, strict=True))[first:]:
-        if joint.nv != 1 or not _is_simple(_joint_axis(model.pin_model, joint.id)):
+        # prismatic, or revolute with an axis of length 1
+        axis = _joint_axis(model.pin_model, joint.id).reshape(2, -1)
+        if joint.nv != 1 or not np.allclose(np.sort(np.linalg.norm(axis, axis=1)), [0.0, 1.0]):
             return f"the compiled code does not support joint {name!r} ({joint.shortname()})"
     try:
-        row_lanes()
+        tree_lanes()
     except ImportError as error:
         return f"Numba cannot be imported: {error}"
     return None
@@ -46,49 +42,14 @@ def why_not(model: "RobotModel") -> str | None:
 
 def keeps_code() -> bool:
     """Return whether there is a cache folder for compiled code."""
-    return row_lanes().inertial_rows.stats.cache_path is not None
-
-
-class CompiledWriter:
-    """Writes blocks of rows into the same memory; one writer per thread."""
-
-    def __init__(self, model: "RobotModel", tree: "Tree", plan: RowPlan, out: Array) -> None:
-        """Prepare to write to ``out``, shape (C, k), k a multiple of 8; see ``why_not`` before."""
-        self._model, self._tree, self._out = model, tree, out
-        self._places = _places(tree, plan)
-        self._ends = np.append(plan.drive_places, plan.torques)
-        self._plan, self._widths = plan, np.diff(plan.first)
-        self._root = np.zeros(out.shape[1])
-        self._work = tree.work_space()
-
-    def load(self, motion: Trajectory, part: slice, values: Array, weights: Array | None) -> None:
-        """Load the samples of the next blocks, and their drive columns: values (k, N)."""
-        q, v, a, tau = motion.q[part], motion.v[part], motion.a[part], motion.tau[part]
-        if self._model.free_flyer:  # the pose has one more entry than the twist
-            self._motion = own_motion(q[:, 1:], v, a, _base_state(self._model, q, v, a))
-        else:
-            self._motion = own_motion(q, v, a)
-        values = values[self._plan.drive_numbers]
-        if (self._plan.ratios != 1.0).any():
-            values *= self._plan.ratios
-        self._values = np.array(np.vstack([values, tau.T]), order="C")  # as of ``own_motion``
-        self._weights = np.zeros((0, 0)) if weights is None else np.array(weights, float, order="C")
-
-    def write(self, start: int, stop: int) -> None:
-        """Write the rows of samples start to stop of those loaded, at most k."""
-        lanes, span = row_lanes(), (start, stop)
-        lanes.inertial_rows(self._tree, self._places, self._motion, self._work, self._out, span)
-        lanes.finish_rows(
-            self._values, self._ends, self._widths, self._weights, self._root, self._out, span
-        )
+    return tree_lanes().inertial_rows.stats.cache_path is not None
 
 
 class Tree(NamedTuple):
     """A robot's B bodies as arrays for compiled code. Parents come before their children."""
 
     parents: Array  # parent of each body, shape (B,), int; -1: the world
-    # constants of each joint, its ratio to its coordinate and its offset, shape (B, 41)
-    joints: Array
+    joints: Array  # constants of each joint, its ratio and offset to its coordinate, (B, 41)
     leaders: Array  # coordinate that moves each joint, shape (B,), int
     rows: Array  # row of the regressor of each slot of each body, shape (B, D), int; -1 if unused
     depths: Array  # number of rows that each body affects, shape (B,), int
@@ -99,25 +60,22 @@ class Tree(NamedTuple):
     @property
     def prismatic(self) -> Array:
         """Which joints are prismatic, shape (B,), bool."""
-        prismatic: Array = np.any(self.joints[:, 33:36], axis=1)
-        return prismatic
+        return np.asarray(np.any(self.joints[:, 33:36], axis=1))
 
     @property
     def axes(self) -> Array:
         """Directions of the joints in the frames of their bodies, shape (B, 3)."""
-        axes: Array = self.joints[:, 33:36] + self.joints[:, 36:39]  # of which one is 0
-        return axes
+        return np.asarray(self.joints[:, 33:36] + self.joints[:, 36:39])  # of which one is 0
 
     def work_space(self) -> Array:
-        """Return a new work space for ``row_lanes``."""
-        work: Array = row_lanes().work_of(*self.rows.shape)
-        return work
+        """Return a new work space for ``tree_lanes``."""
+        return np.asarray(tree_lanes().work_of(*self.rows.shape))
 
     def places(self, wanted: Array) -> Array:
         """Return the places (B, D, 10) of the columns of each body in each of its rows."""
         by_body = wanted.reshape(len(wanted), -1, 10).swapaxes(0, 1)  # (B, n_rows, 10)
-        found = np.take_along_axis(by_body, self.rows.clip(min=0)[..., None], axis=1)
-        return np.where(self.rows[..., None] >= 0, found, -1)
+        places = np.take_along_axis(by_body, self.rows.clip(min=0)[..., None], axis=1)
+        return np.where(self.rows[..., None] >= 0, places, -1)
 
     def part(self, bodies: Array) -> "Tree":
         """Return some bodies as a separate tree: bodies (k,)."""
@@ -137,7 +95,7 @@ def own_motion(
     return q, v, a, base
 
 
-def flatten(model: "RobotModel") -> Tree:
+def flatten(model: RobotModel) -> Tree:
     """Return a robot as arrays."""
     pin_model, G = model.pin_model, model.velocity_map
     size = pin_model.njoints - 1
@@ -166,14 +124,6 @@ def flatten(model: "RobotModel") -> Tree:
     return Tree(parents, joints, leaders, table, depths, slots, is_below, gravity)
 
 
-def _places(tree: Tree, plan: RowPlan) -> Array:
-    """Return the places of each body's columns in each of its rows, (B, D, 10); -1: none."""
-    table = np.full((len(plan.inertial), 10 * len(tree.parents)), -1)
-    for row, wanted, place in zip(table, plan.inertial, plan.places, strict=True):
-        row[wanted] = place
-    return tree.places(table)
-
-
 def joint_constants(pin_model: pin.Model, body: int) -> Array:
     """Return A, B, C (by columns), p0, d and the axis (v, w) of a joint, shape (39,)."""
     linear, angular = _joint_axis(pin_model, body).reshape(2, 3)
@@ -190,28 +140,12 @@ def _joint_axis(pin_model: pin.Model, body: int) -> Array:
     data, q = pin_model.createData(), pin.neutral(pin_model)
     joint = pin_model.joints[body]
     jacobian = pin.computeJointJacobian(pin_model, data, q, body)
-    axis: Array = jacobian.reshape(6, -1)[
-        :, joint.idx_v
-    ]  # Pinocchio has one dimension of one joint
-    return axis
-
-
-def _is_simple(axis: Array) -> bool:
-    """Return whether a joint is prismatic or revolute with an axis of length 1."""
-    lengths = np.linalg.norm(axis.reshape(2, 3), axis=1)
-    return bool(np.allclose(np.sort(lengths), [0.0, 1.0]))
-
-
-def _base_state(model: "RobotModel", q: Array, v: Array, a: Array) -> Array:
-    """Return v, w, a - g, dw of the floating base in its own frame, shape (12, k)."""
-    g = model.pin_model.gravity.linear
-    gravity = in_base(q[:, 3:7], g)
-    return np.vstack([v[:, :6].T, (a[:, :3] - gravity).T, a[:, 3:6].T])
+    return np.asarray(jacobian.reshape(6, -1)[:, joint.idx_v])  # of one joint it is a vector
 
 
 @cache
-def row_lanes() -> ModuleType:
+def tree_lanes() -> ModuleType:
     """Return the compiled code of rows; it imports Numba."""
-    import robotid.dynamics.kernels.row_lanes
+    import robotid.dynamics.kernels.tree_lanes
 
-    return robotid.dynamics.kernels.row_lanes
+    return robotid.dynamics.kernels.tree_lanes

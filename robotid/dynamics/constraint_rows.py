@@ -183,7 +183,7 @@ def constrained(
         used = used & ~motion.switching[:, None]
     if not model.constraints:
         return motion, used
-    known, tau, parts = _measured(model), motion.tau.copy(), []
+    known, tau, parts = measured_rows(model), motion.tau.copy(), []
     contacts, floats = touching(model, motion), model.free_flyer and not used[:, 6:].any()
     for start in range(0, max(len(tau), 1), _BLOCK):
         k = slice(start, start + _BLOCK)
@@ -212,12 +212,9 @@ def touching(model: RobotModel, motion: Trajectory) -> Array:
 
 
 def constraint_forces(model: RobotModel, motion: Trajectory, torque: Array, used: Array) -> Array:
-    """Return the constraint forces for which a robot has a torque (N, n_rows), (N, m) [N, N m].
-
-    Unknown ones are those of least squares.
-    """
+    """Return forces (N, m) [N, N m] for which a robot has a torque; unknown: least squares."""
     J = constraint_jacobian(model, motion.q, touching(model, motion))
-    known, tau = _measured(model), motion.tau if motion.loaded is None else motion.loaded
+    known, tau = measured_rows(model), motion.tau if motion.loaded is None else motion.loaded
     f = np.zeros(J.shape[:2])
     if motion.wrenches is not None:
         f[:, known] = motion.wrenches
@@ -268,7 +265,7 @@ def _imu_frame(model: RobotModel, link: str) -> ImuFrame:
     return ImuFrame(turn, place.translation.copy(), gravity.copy())
 
 
-def _measured(model: RobotModel) -> list[int]:
+def measured_rows(model: RobotModel) -> list[int]:
     """Return the rows of the Jacobian whose forces are measured."""
     rows, first = [], 0
     for x in model.constraints:

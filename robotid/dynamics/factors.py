@@ -43,9 +43,7 @@ class Factors:
     columns: tuple[Array, ...]  # the columns of joint j, n arrays of shape (c_j,), ascending
     rows: Array  # number of rows folded in per joint, shape (n,), int
     names: tuple[str, ...]  # names of the c columns
-    # whether constraint forces were eliminated from the rows: the rows of all joints are
-    # mixed, and have one noise level
-    is_projected: bool = False
+    is_projected: bool = False  # without constraint forces: rows are mixed, with one noise level
 
     @property
     def R(self) -> Array:
@@ -109,8 +107,7 @@ class Factors:
         squares = self.residual_squares(theta)
         if self.is_projected:
             squares, freedom = (np.full(len(x), x.sum()) for x in (squares, freedom))
-        levels: Array = np.sqrt(squares / freedom)
-        return levels
+        return np.asarray(np.sqrt(squares / freedom))
 
     def torque_squares(self) -> Array:
         """Return the sum of squared torques |tau_j|^2, shape (n,) [(N m)^2 or N^2]."""
@@ -157,10 +154,8 @@ def compress(problem: Problem, *, threads: int | None = None) -> Factors:
     """Fold a problem into its factors, block by block.
 
     Long problems are cut into parts of a fixed number of samples, whose factors are merged in
-    order: the result does not depend on the number of threads.
-
-    References:
-        Demmel, Grigori, Hoemmen, Langou (2012), Communication-optimal parallel and sequential QR.
+    order: the result does not depend on the number of threads. See Demmel, Grigori, Hoemmen, Langou
+    (2012), Communication-optimal parallel and sequential QR.
     """
     columns = [np.flatnonzero(row) for row in problem.support]
     triangles = [Triangle(len(own) + 1) for own in columns]
@@ -168,9 +163,16 @@ def compress(problem: Problem, *, threads: int | None = None) -> Factors:
         rows = _fold_sources(triangles, columns, problem.sources, threads)
     else:
         rows = _fold_blocks(triangles, columns, problem)
-    factors = tuple(triangle.R for triangle in triangles)
-    _require_finite(factors)
-    return Factors(factors, tuple(columns), rows, problem.names, problem.is_projected)
+    return _factors_of([triangle.R for triangle in triangles], columns, rows, problem)
+
+
+def _factors_of(
+    triangles: Sequence[Array], columns: Sequence[Array], rows: Array, problem: Problem
+) -> Factors:
+    """Return the factors of some rows of a problem; R is not finite if a row is not."""
+    if not all(np.isfinite(R).all() for R in triangles):
+        raise DataError("the problem has a row that is not finite; check the trajectory")
+    return Factors(tuple(triangles), tuple(columns), rows, problem.names, problem.is_projected)
 
 
 def compress_segments(
@@ -186,11 +188,13 @@ def compress_segments(
         places, starts = _places(source, columns), range(0, source.samples, length)
         folded = _folded(source, part, length, threads)
         for start, triangles in zip(starts, folded, strict=True):
-            _require_finite(triangles)
             rows = source.rows(start, min(start + length, source.samples))
-            placed = zip(triangles, places, columns, strict=True)
-            own = tuple(_placed(R, place, len(wanted) + 1) for R, place, wanted in placed)
-            segments.append(Factors(own, columns, rows, problem.names, problem.is_projected))
+            placed = []
+            for R, place, wanted in zip(triangles, places, columns, strict=True):
+                total = Triangle(len(wanted) + 1)
+                total.fold_triangle(R, place)
+                placed.append(total.R)
+            segments.append(_factors_of(placed, columns, rows, problem))
     return tuple(segments)
 
 
@@ -201,10 +205,8 @@ def merge(factors: Sequence[Factors]) -> Factors:
     first = factors[0]
     for other in factors[1:]:
         if other.names != first.names or len(other.rows) != len(first.rows):
-            raise DataError(
-                f"factors differ: {len(first.rows)} joints x {len(first.names)} columns and "
-                f"{len(other.rows)} joints x {len(other.names)} columns"
-            )
+            sizes = (f"{len(x.rows)} joints x {len(x.names)} columns" for x in (first, other))
+            raise DataError(f"factors differ: {' and '.join(sizes)}")
     triangles, columns = [], []
     for j in range(len(first.rows)):
         own = np.unique(np.concatenate([f.columns[j] for f in factors]))
@@ -236,10 +238,7 @@ def join(reductions: Sequence[Reduction]) -> Reduction:
 
 
 def join_segments(reductions: Iterable[Reduction], count: int, most: int) -> list[Reduction]:
-    """Return the reductions of at most so many segments of neighbouring pieces, in order.
-
-    They are joined one by one, to limit the memory; the last one may be shorter.
-    """
+    """Return reductions of at most so many segments, joined one by one to limit the memory."""
     length = -(-count // most)
     segments: list[Reduction] = []
     for k, reduction in enumerate(reductions):
@@ -265,19 +264,16 @@ def in_order(
     threads: int | None = None,
 ) -> Iterator[ResultT]:
     """Yield the result of work for each item in order, with threads where that is faster."""
-    workers = (available_cores() if is_parallel else 1) if threads is None else threads
-    if min(workers, len(items)) <= 1:
+    most = (available_cores() if is_parallel else 1) if threads is None else threads
+    if (workers := min(most, len(items))) <= 1:
         yield from map(work, items)
         return
-    with ThreadPoolExecutor(min(workers, len(items))) as pool:
+    with ThreadPoolExecutor(workers) as pool:
         yield from pool.map(work, items)
 
 
 class Triangle:
-    """A triangular factor into which rows are folded.
-
-    It is changed in place, unlike other objects of the package: it is the innermost loop.
-    """
+    """A triangular factor into which rows are folded, in place: it is the innermost loop."""
 
     def __init__(self, columns: int) -> None:
         """Initialise for rows of so many columns."""
@@ -290,11 +286,7 @@ class Triangle:
         self._sizes[[4, 6]] = columns, self._panel
 
     def fold(self, rows: Array) -> None:
-        """Replace R by the triangular factor of [R; rows]: rows (m, c).
-
-        References:
-            LAPACK Working Note 257; Golub, Van Loan (2013), Matrix Computations, section 6.5.3.
-        """
+        """Replace R by the factor of [R; rows], rows (m, c) (Golub, Van Loan 2013, 6.5.3)."""
         self._fold(rows, 0, 0)
 
     def fold_triangle(self, other: Array, places: Array) -> None:
@@ -384,8 +376,7 @@ def _fold_sources(
         for part in _folded(source, _PART, _PART, threads):
             for triangle, place, R_j in zip(triangles, places, part, strict=True):
                 triangle.fold_triangle(R_j, place)
-    rows: Array = np.sum([source.rows(0, source.samples) for source in sources], axis=0)
-    return rows
+    return np.asarray(np.sum([source.rows(0, source.samples) for source in sources], axis=0))
 
 
 def _places(source: RowSource, columns: Sequence[Array]) -> list[Array]:
@@ -394,21 +385,6 @@ def _places(source: RowSource, columns: Sequence[Array]) -> list[Array]:
         np.append(np.searchsorted(wanted, own), len(wanted))
         for wanted, own in zip(columns, source.columns, strict=True)
     ]
-
-
-def _placed(R: Array, places: Array, size: int) -> Array:
-    """Return the factor of the same rows with more columns, shape (size, size)."""
-    if len(places) == size:
-        return R
-    total = Triangle(size)
-    total.fold_triangle(R, places)
-    return total.R
-
-
-def _require_finite(triangles: Sequence[Array]) -> None:
-    """Refuse factors of rows that are not finite: R is not finite then either."""
-    if not all(np.isfinite(R).all() for R in triangles):
-        raise DataError("the problem has a row that is not finite; check the trajectory")
 
 
 def _folded(

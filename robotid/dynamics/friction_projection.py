@@ -18,7 +18,7 @@ from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.dynamics.prediction import drive_motion_along
-from robotid.robot.drive_term import DriveMotion, DriveTerm
+from robotid.robot.drive_term import DriveTerm
 from robotid.robot.drives import TERMS, Lag, LuGre, Presliding, Spring
 from robotid.robot.model import RobotModel, pinocchio_model
 
@@ -36,16 +36,14 @@ _ROUNDING = 1e-12  # of the largest eigenvalue of products: a smaller one counts
 class DriveMoments:
     """Second moments of the terms of one drive over the rows of the logs."""
 
-    # the drive's own terms except inertia, then the terms of a simulator that it lacks
-    terms: tuple[str, ...]
+    terms: tuple[str, ...]  # the drive's, except inertia, then those of a simulator that it lacks
     products: Array  # mean products of their columns over the rows, shape (k, k)
     torque: float  # RMS torque of the rows in the drive's joints [N m or N]
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for result.json."""
-        return {
-            "terms": list(self.terms), "products": self.products.tolist(), "torque": self.torque
-        }  # fmt: skip
+        products = self.products.tolist()
+        return {"terms": list(self.terms), "products": products, "torque": self.torque}
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> "DriveMoments":
@@ -62,15 +60,13 @@ class DriveMoments:
         """Return the linear map from a drive's parameters to those of its projection."""
         root = self._root()
         Y, X = (root[:, [self.terms.index(name) for name in names]] for names in (onto, own))
-        T: Array = np.linalg.lstsq(Y, X, rcond=None)[0]
-        return T
+        return np.linalg.lstsq(Y, X, rcond=None)[0]
 
     def _root(self) -> Array:
         """Return M with M^T M the products, shape (k, k)."""
         values, vectors = np.linalg.eigh(self.products)
         floor = _ROUNDING * max(float(values[-1]), 0.0)
-        root: Array = np.sqrt(np.where(values > floor, values, 0.0))[:, None] * vectors.T
-        return root
+        return np.asarray(np.sqrt(np.where(values > floor, values, 0.0))[:, None] * vectors.T)
 
     def rms(self, x: Mapping[str, float]) -> float:
         """Return the RMS torque of a sum of terms over the rows [N m or N]."""
@@ -85,9 +81,7 @@ class ProjectedDrive:
     name: str  # joint or coupling
     replaced: tuple[str, ...]  # the terms that the format lacks
     values: Mapping[str, float]  # parameters of the terms that the format has, by name
-    # map from the drive's parameters to these, shape (len(values), m); 0 in the row of a
-    # parameter at its bound of 0
-    transfer: Array
+    transfer: Array  # map from the drive's m parameters to these; rows at a bound of 0 are 0
     own: tuple[int, ...]  # indices of the drive's m parameters in the layout of the robot
     error: float  # RMS error of the projection [N m or N]
     torque: float  # RMS torque of the drive's joints [N m or N]
@@ -106,10 +100,8 @@ class ProjectedDrive:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for sidecars."""
-        return {
-            "replaced": list(self.replaced), **self.values,
-            "error": self.error, "torque": self.torque,
-        }  # fmt: skip
+        numbers = {**self.values, "error": self.error, "torque": self.torque}
+        return {"replaced": list(self.replaced), **numbers}
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +110,7 @@ class Projection:
 
     model: RobotModel  # the robot
     pi: Array  # its standard parameters, shape (p,), SI units
-    # the drives whose terms were projected; the others are unchanged
-    drives: tuple[ProjectedDrive, ...]
+    drives: tuple[ProjectedDrive, ...]  # those whose terms were projected
 
 
 def drive_moments(
@@ -129,19 +120,20 @@ def drive_moments(
 
     Friction is that of ``predict``: internal states are at their steady value, without a delay.
     """
-    layout = model.layout
+    layout, n = model.layout, len(model.joints)
     sums: dict[str, tuple[tuple[str, ...], Array, float, int]] = {}
-    n = len(model.joints)
     for trajectory, mask in recordings if layout.own else ():
-        along = drive_motion_along(model, trajectory)
-        motion = replace(along, rate=np.zeros_like(along.rate), begins=None)
+        motion = replace(drive_motion_along(model, trajectory, has_rate=False), begins=None)
         for d, drive in enumerate(layout.drives):
             if drive.name not in layout.own:
                 continue
             moved = layout.drive_ratios[d] != 0.0
             rows = mask[:, -n:][:, moved].all(axis=1)
-            names, columns = _columns(model, d, motion.of(d))
-            X, tau = columns[:, rows], trajectory.tau[:, -n:][rows][:, moved]
+            terms = {term.name: term for _, term in _own_terms(model, d)}
+            terms |= {name: term for name, term in _SIMPLE.items() if name not in terms}
+            columns = np.array([term.column(motion.of(d)) for term in terms.values()])
+            names, X = tuple(terms), columns[:, rows]
+            tau = trajectory.tau[:, -n:][rows][:, moved]
             _, products, total, count = sums.get(drive.name, (names, 0.0 * X @ X.T, 0.0, 0))
             total += float((tau**2).sum())
             sums[drive.name] = (names, products + X @ X.T, total, count + int(rows.sum()))
@@ -150,13 +142,6 @@ def drive_moments(
         for name, (names, products, total, count) in sums.items()
         if count
     }
-
-
-def _columns(model: RobotModel, d: int, motion: DriveMotion) -> tuple[tuple[str, ...], Array]:
-    """Return the names and columns, shape (k, N), of a drive's terms and of those it lacks."""
-    terms = {term.name: term for _, term in _own_terms(model, d)}
-    terms |= {name: term for name, term in _SIMPLE.items() if name not in terms}
-    return tuple(terms), np.array([term.column(motion) for term in terms.values()])
 
 
 def _own_terms(model: RobotModel, d: int) -> list[tuple[int, DriveTerm]]:
@@ -221,7 +206,7 @@ def _projected(
     has_spring = any(term.part in ("spring", "ripple") for _, term in own)
     usable = {*names, "spring"} if has_spring else {*names}
     bounded = [name for name in _SIMPLE if name in onto and name in usable and name != "offset"]
-    best, least, T_best = tuple[str, ...](), np.inf, np.zeros((0, len(names)))
+    least, transfers = np.inf, dict[str, Array]()
     for free in chain.from_iterable(combinations(bounded, k) for k in range(len(bounded) + 1)):
         onto_free = (*free, "offset")  # the others are at their bound of 0
         T = moments.transfer(names, onto_free)
@@ -229,12 +214,10 @@ def _projected(
         left.subtract(dict(zip(onto_free, (T @ x).tolist(), strict=True)))
         error = moments.rms(left)
         if ((T @ x)[:-1] >= 0).all() and error < least:
-            best, least, T_best = onto_free, error, T
+            least, transfers = error, dict(zip(onto_free, T, strict=True))
     stated = [name for name in _SIMPLE if name in bounded or (name in onto and name in names)]
-    transfer, drive = np.zeros((len(stated), len(names))), model.layout.drives[d]
-    for k, name in enumerate(stated):
-        if name in best:
-            transfer[k] = T_best[best.index(name)]
+    drive, none = model.layout.drives[d], np.zeros(len(names))
+    transfer = np.array([transfers.get(name, none) for name in stated]).reshape(-1, len(names))
     return ProjectedDrive(
         drive.name, tuple(excess), dict(zip(stated, (transfer @ x).tolist(), strict=True)),
         transfer, tuple(k for k, _ in own), error=least, torque=moments.torque,

@@ -17,13 +17,17 @@ from robotid.base.typing import Array, real_numbers
 from robotid.data.log import Trajectory
 from robotid.dynamics.compiled import work_per_sample
 from robotid.dynamics.constraint_rows import without_forces
-from robotid.dynamics.drive_columns import (
+from robotid.dynamics.rows import (
+    BLOCK,
+    COMPILED,
+    InertialRows,
+    TrajectoryRows,
     drive_motion,
     friction_directions,
     remembered,
+    trajectory_rows,
     trajectory_values,
 )
-from robotid.dynamics.rows import BLOCK, COMPILED, InertialRows, TrajectoryRows, trajectory_rows
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.drive_term import DriveMotion
 from robotid.robot.drives import Lag
@@ -39,9 +43,7 @@ class TorqueSlopes(NamedTuple):
     by_v: Array  # by the velocities, likewise
     by_a: Array  # by the accelerations, likewise: the mass matrix of the bodies
     by_gravity: Array  # by gravity, along the axes of the world, shape (N, n, 3)
-    # by the origin of each joint in the frame of the body before, shape (N, n, n, 3): torque,
-    # joint, axis
-    by_origin: Array
+    by_origin: Array  # by each joint's origin in the body before, (N, n, n, 3): torque, joint, axis
 
 
 def predict(
@@ -56,10 +58,8 @@ def predict(
     Along a motion with constraints it is the torque that constraint forces cannot cause, P W theta.
 
     It is computed by the rows of the regressor for all vectors together, or, if the rows are not
-    compiled and the vectors are few, by inverse dynamics, once per vector.
-
-    References:
-        Luh, Walker, Paul (1980), On-Line Computational Scheme for Mechanical Manipulators.
+    compiled and the vectors are few, by inverse dynamics, once per vector. See Luh, Walker, Paul
+    (1980), On-Line Computational Scheme for Mechanical Manipulators.
     """
     source = trajectory_rows(model, trajectory, None, compiled)
     stacked = np.column_stack(list(parameters))
@@ -114,7 +114,12 @@ def predict_instants(
     direction = friction_directions(model.layout, v, None)
     if model.is_static:
         v, a = np.zeros_like(v), np.zeros_like(a)
-    return _rows_by_pi(model, pi, q, v, a, direction).reshape(wanted)
+    torque = np.empty_like(v)
+    for start in range(0, len(v), BLOCK):
+        k = slice(start, start + BLOCK)
+        Y = joint_torque_regressor(model, q[k], v[k], a[k], direction[k])
+        torque[k] = (Y @ pi).reshape(-1, model.n_rows)
+    return torque.reshape(wanted)
 
 
 def rigid_parts(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> list[Array]:
@@ -123,24 +128,10 @@ def rigid_parts(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> l
     They are g(q) = tau(q, 0, 0), M(q) a = tau(q, 0, a) - g(q) and C(q, v) v = tau(q, v, a) -
     tau(q, 0, a). Their sum is the torque of the bodies.
     """
-    bodies = np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
-    rigid = _newton_euler if _has_centres(model, pi) else _rows_by_pi
     still = np.zeros_like(v)
-    g, g_and_Ma, whole = (rigid(model, bodies, q, *x) for x in ((still, still), (still, a), (v, a)))
-    return [g, g_and_Ma - g, whole - g_and_Ma]
-
-
-def _rows_by_pi(
-    model: RobotModel, pi: Array, q: Array, v: Array, a: Array, direction: Array | None = None
-) -> Array:
-    """Return Y pi at independent samples, shape (N, n_rows), by blocks."""
-    torque = np.empty_like(v)
-    for start in range(0, len(v), BLOCK):
-        k = slice(start, start + BLOCK)
-        signs = None if direction is None else direction[k]
-        Y = joint_torque_regressor(model, q[k], v[k], a[k], signs)
-        torque[k] = (Y @ pi).reshape(-1, model.n_rows)
-    return torque
+    states = ((still, still), (still, a), (v, a))
+    g, g_and_Ma, total = (_bodies_torque(model, pi, q, *x) for x in states)
+    return [g, g_and_Ma - g, total - g_and_Ma]
 
 
 def _from_rows(source: TrajectoryRows, stacked: Array) -> list[Array]:
@@ -178,25 +169,24 @@ def _has_centres(model: RobotModel, pi: Array) -> bool:
 
 
 def inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
-    """Return the torque W pi by the recursive Newton-Euler algorithm and the drives' terms.
-
-    For inconsistent bodies, as of ordinary least squares, it is the difference of the torques of
-    two sets of consistent bodies.
-    """
-    m, added = trajectory, _consistent_addition(model, pi)
-    torque = _newton_euler(model, pi + added, m.q, m.v, m.a)
-    if added.any():
-        torque -= _newton_euler(model, added, m.q, m.v, m.a)
+    """Return the torque W pi by the recursive Newton-Euler algorithm and the drives' terms."""
+    torque = _bodies_torque(model, pi, trajectory.q, trajectory.v, trajectory.a)
     if pi[model.layout.n_inertial :].any():
-        torque[:, model.n_rows - len(model.joints) :] += drive_torque(model, pi, m)
+        torque[:, model.n_rows - len(model.joints) :] += drive_torque(model, pi, trajectory)
     return torque
+
+
+def _bodies_torque(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> Array:
+    """Return the torque of bodies, of inconsistent ones as a difference, shape (N, n_rows)."""
+    added = _consistent_addition(model, pi)
+    torque = _newton_euler(model, pi + added, q, v, a)
+    return torque - _newton_euler(model, added, q, v, a) if added.any() else torque
 
 
 def drive_torque(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
     """Return the torque of the drives' terms, shape (N, n) [N m, N]: pi (p,)."""
     layout, theta = model.layout, pi[model.layout.n_inertial :]
-    torque: Array = trajectory_values(layout, trajectory).T @ (layout.drive_loads * theta).T
-    return torque
+    return np.asarray(trajectory_values(layout, trajectory).T @ (layout.drive_loads * theta).T)
 
 
 def body_slopes(model: RobotModel, pi: Array, trajectory: Trajectory) -> TorqueSlopes:
@@ -205,12 +195,8 @@ def body_slopes(model: RobotModel, pi: Array, trajectory: Trajectory) -> TorqueS
 
 
 def body_slopes_by_position(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
-    """Return the derivatives of the bodies' torque by the positions alone, shape (N, n, n).
-
-    The others of ``body_slopes`` take several times as long.
-    """
-    (by_q,) = _of_consistent(_position_slopes, model, pi, trajectory)
-    return by_q
+    """Return ``body_slopes`` by the positions alone, (N, n, n), several times as fast."""
+    return _of_consistent(_position_slopes, model, pi, trajectory)[0]
 
 
 def _of_consistent(
@@ -266,11 +252,7 @@ def _position_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array)
 
 
 def _torque_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> tuple[Array, ...]:
-    """Return the arrays of ``TorqueSlopes``.
-
-    References:
-        Carpentier, Mansard (2018), Analytical Derivatives of Rigid Body Dynamics Algorithms.
-    """
+    """Return the arrays of ``TorqueSlopes`` (Carpentier, Mansard 2018, Analytical Derivatives)."""
     plain, G = model.with_parameters(pi).pin_model, model.velocity_map
     extended, joints = _with_movable_origins(plain)
     own = np.array([extended.joints[k].idx_v for k in joints])  # rows of the robot's own joints
@@ -340,17 +322,14 @@ def drive_motion_along(
     """
     key, known = (model.pin_model, model.layout, has_rate), trajectory.derived.get("drive motion")
     if known is None or known[0] != key or not np.array_equal(known[1], model.carried_by):
-        found = _drive_motion(model, trajectory, has_rate)
-        trajectory.derived["drive motion"] = known = key, model.carried_by, found
+        moved = _drive_motion(model, trajectory, has_rate)
+        trajectory.derived["drive motion"] = known = key, model.carried_by, moved
     motion: DriveMotion = known[2]
     return motion
 
 
 def _load_torque(model: RobotModel, trajectory: Trajectory) -> Array:
-    """Return the torque of the bodies by the model's reference, shape (N, n_rows) [N m, N].
-
-    The last one is stored with the trajectory: it is that of any terms of the drives.
-    """
+    """Return the bodies' torque by the model's reference, once, (N, n_rows) [N m, N]."""
     pi = model.carried_by[: model.layout.n_inertial]
     known = trajectory.derived.get("load torque")
     if known is None or known[0] is not model.pin_model or not np.array_equal(known[1], pi):
@@ -359,8 +338,7 @@ def _load_torque(model: RobotModel, trajectory: Trajectory) -> Array:
         bodies[: len(pi)] = pi
         (load,) = predict(plain, [bodies], trajectory)
         trajectory.derived["load torque"] = known = model.pin_model, pi, load
-    torque: Array = known[2]
-    return torque
+    return known[2]
 
 
 def _drive_motion(model: RobotModel, trajectory: Trajectory, has_rate: bool) -> DriveMotion:

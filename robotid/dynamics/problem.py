@@ -66,13 +66,10 @@ class Problem:
     names: tuple[str, ...]  # names of the c columns
     n_joints: int  # number n of rows per sample
     support: Array  # shape (n, c), bool: False where row j is zero for every motion
-    # starts a new pass over the regressors of the mass matrix of each block's samples, shape
-    # (k, n, n, c), or None if the problem has none
+    # starts a new pass over the regressors of the mass matrices of each block, (k, n, n, c)
     mass_stream: Callable[[], Iterator[Array]] | None = None
-    # the same rows joint by joint, in order; empty if there are only blocks
-    sources: tuple[RowSource, ...] = ()
-    # whether constraint forces were eliminated from the rows, as of ``Factors``
-    is_projected: bool = False
+    sources: tuple[RowSource, ...] = ()  # the same rows joint by joint; empty: only blocks
+    is_projected: bool = False  # whether constraint forces were eliminated, as of ``Factors``
 
     def __post_init__(self) -> None:
         wanted = (self.n_joints, len(self.names))

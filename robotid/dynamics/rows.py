@@ -1,10 +1,15 @@
-"""Rows of a trajectory's problem joint by joint: regressor, torque and weight, block by block."""
+"""Rows of a trajectory's problem joint by joint: regressor, torque and weight, block by block.
+
+Inertial columns are computed by Pinocchio or by compiled code, drive columns by the terms of the
+drives. Shapes: q (N, n), v and a (N, n_rows).
+"""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -12,25 +17,28 @@ import pinocchio as pin
 from robotid.base.exceptions import DataError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
+from robotid.data.base_motion import in_base
 from robotid.data.log import Trajectory
 from robotid.dynamics.compiled import (
     LONG_ENOUGH,
-    CompiledWriter,
     Tree,
     flatten,
     keeps_code,
+    own_motion,
+    tree_lanes,
     why_not,
     work_per_sample,
 )
-from robotid.dynamics.drive_columns import RowPlan, plan_rows, trajectory_values
 from robotid.dynamics.problem import RowSource
+from robotid.robot.drive_term import DriveMotion
 from robotid.robot.model import RobotModel
+from robotid.robot.parameters import ParameterLayout
 
 BLOCK = 512  # samples per block: with 100 columns it fits in the cache
 COMPILED = "compiled by Numba"
 
-_LANES = 64  # the compiled path works on whole groups of so many samples
-_BLOCK_SIZE = 2**18  # numbers per block, 2 MiB, but at least one group of samples
+BLOCK_SIZE = 2**18  # numbers per block, 2 MiB, but at least one group of samples
+_GROUP = 64  # samples: a multiple of those that compiled code computes together
 _LOADED = 8  # blocks that a writer loads together
 _MOST_BYTES = 2**25  # of inertial columns that are stored with a trajectory
 
@@ -52,13 +60,141 @@ def choose_engine(model: RobotModel, samples: int, compiled: bool | None) -> str
     return engine
 
 
+def drive_values(
+    layout: ParameterLayout,
+    q: Array,
+    v: Array,
+    a: Array,
+    direction: Array,
+    memory: Array | None = None,
+) -> Array:
+    """Return the columns of drive parameters, (k, N); ``drive_loads[j]`` times these: row j."""
+    motion = drive_motion(layout, q, v, a, direction)
+    states, wanted = np.empty((len(v), 0)) if memory is None else memory, layout.remembering
+    if states.shape != (len(v), len(wanted)):
+        raise DataError(
+            f"memory has shape {states.shape}, wanted {(len(v), len(wanted))}: a column for each "
+            "drive parameter with internal state or load; call remember() with the trajectory first"
+        )
+    values = np.empty((len(layout.drive_parameters), len(v)))
+    for k, (d, term) in enumerate(layout.drive_parameters):
+        if k not in wanted:
+            values[k] = term.column(motion.of(d))
+    values[list(wanted)] = states.T
+    return values
+
+
+def trajectory_values(
+    layout: ParameterLayout, motion: Trajectory, part: slice = slice(None)
+) -> Array:
+    """Return the columns of drive parameters along a trajectory, (k, N); see ``drive_values``."""
+    direction, memory = (None if x is None else x[part] for x in (motion.direction, motion.memory))
+    signs = friction_directions(layout, motion.v[part], direction)
+    state = motion.q[part], motion.v[part], motion.a[part]
+    return drive_values(layout, *state, signs, memory)
+
+
+def drive_motion(
+    layout: ParameterLayout,
+    q: Array,
+    v: Array,
+    a: Array,
+    direction: Array,
+    load: Array | None = None,
+    rate: Array | None = None,
+    begins: Array | None = None,
+) -> DriveMotion:
+    """Return the motion and load of drives, arrays of shape (d, N): load and rate (N, n)."""
+    R = layout.drive_ratios
+    n = R.shape[1]
+    w = R @ v[:, v.shape[1] - n :].T
+    still = np.broadcast_to(0.0, w.shape)
+    share = R / np.sum(R**2, axis=1, keepdims=True).clip(min=1e-300)  # a drive's part of the load
+    return DriveMotion(
+        q=R @ q[:, q.shape[1] - n :].T,
+        v=w,
+        a=R @ a[:, a.shape[1] - n :].T,
+        direction=direction.T if direction.shape[1] else w,
+        load=still if load is None else share @ load.T,
+        rate=still if rate is None else share @ rate.T,
+        begins=begins,
+    )
+
+
+def remembered(layout: ParameterLayout, motion: DriveMotion) -> Array:
+    """Return the columns of drive parameters with internal state or load, shape (N, m)."""
+    own = [layout.drive_parameters[k] for k in layout.remembering]
+    return np.column_stack([term.column(motion.of(d)) for d, term in own])
+
+
+def friction_speeds(layout: ParameterLayout) -> Array:
+    """Return the speeds (c, n) whose sign is the direction of friction: joints, then couplings."""
+    ratios: Array = layout.drive_ratios / layout.drive_speeds[:, None]
+    return ratios if layout.follows_direction else ratios[:0]
+
+
+def sure_rows(layout: ParameterLayout, v: Array, least: float) -> Array:
+    """Return the rows in which the sign of friction is certain, shape (N, n_rows), bool."""
+    ratios = friction_speeds(layout)
+    first = v.shape[1] - ratios.shape[1]
+    slow = np.abs(v[:, first:] @ ratios.T) < least  # (N, c)
+    certain = np.ones(v.shape, dtype=bool)
+    certain[:, first:] = ~(slow @ (ratios != 0.0))
+    return certain
+
+
+def friction_directions(layout: ParameterLayout, v: Array, direction: Array | None) -> Array:
+    """Return the directions of friction, shape (N, c): those given, or the signs of the speeds."""
+    speeds = friction_speeds(layout)
+    if direction is None:
+        return np.asarray(np.sign(v[:, v.shape[1] - speeds.shape[1] :] @ speeds.T))
+    wanted = (len(v), len(speeds))
+    if direction.shape != wanted:
+        raise DataError(
+            f"direction has shape {direction.shape}, wanted {wanted}: a column for each Coulomb "
+            "parameter of the model; process the log with the speeds of this model"
+        )
+    return direction
+
+
+class RowPlan(NamedTuple):
+    """The columns of a block of rows and their places, joint by joint."""
+
+    inertial: list[Array]  # per row its inertial columns, n arrays of shape (c_j,)
+    places: list[Array]  # per row their places in the block, likewise
+    drive_places: Array  # places of the E drive columns, shape (E,), int
+    drive_numbers: Array  # their drive parameters, shape (E,), int
+    ratios: Array  # their ratios, shape (E, 1)
+    torques: Array  # per row the place of the torque, the last one of the row, shape (n,), int
+    first: Array  # first place of each row, and the end, shape (n + 1,), int
+
+
+def plan_rows(layout: ParameterLayout, columns: Sequence[Array]) -> RowPlan:
+    """Return the plan of a block of rows: each row's columns in that order, then its torque."""
+    loads, size = layout.drive_loads, layout.n_inertial
+    base = len(columns) - len(loads)  # rows of a floating base, without drives
+    first = np.concatenate([[0], np.cumsum([len(row) + 1 for row in columns])])
+    inertial = [np.flatnonzero(row < size) for row in columns]
+    drives = [
+        (first[j] + k, g - size, loads[j - base, g - size])
+        for j, row in enumerate(columns)
+        for k, g in enumerate(row)
+        if g >= size
+    ]
+    places, numbers, ratios = np.array(drives).reshape(-1, 3).T
+    return RowPlan(
+        [row[k] for row, k in zip(columns, inertial, strict=True)],
+        [start + k for start, k in zip(first, inertial, strict=False)],
+        places.astype(int), numbers.astype(int), ratios[:, None], first[1:] - 1, first,
+    )  # fmt: skip
+
+
 @dataclass(frozen=True, eq=False)
 class InertialRows:
     """Inertial columns of a trajectory's regressor, which are independent of drives."""
 
     pin_model: pin.Model  # the robot
-    # indices of the inertial parameters of each row, n_rows arrays of shape (c_j,)
-    columns: tuple[Array, ...]
+    columns: tuple[Array, ...]  # inertial parameters of each row, n_rows arrays (c_j,), int
     values: Array  # the columns of each row, one row after another, shape (sum of c_j, N)
 
     @cached_property
@@ -78,8 +214,8 @@ class InertialRows:
         return np.stack([stacked[own].T @ self.values[i:j] for own, (i, j) in rows], axis=-1)
 
 
-def inertial_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
-    """Return the inertial columns that affect each row, row by row, shape (sum of c_j, N)."""
+def inertial_rows(model: RobotModel, q: Array, v: Array, a: Array) -> InertialRows:
+    """Return the inertial columns that affect each row; of many joints they are few."""
     columns = _inertial_support(model)
     plan = plan_rows(model.layout, columns)
     out = np.empty((plan.first[-1], min(BLOCK, len(q))))
@@ -89,22 +225,18 @@ def inertial_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
         k = slice(start, min(start + BLOCK, len(q)))
         writer.write_inertial(q[k], v[k], a[k])
         values[:, k] = out[places, : k.stop - k.start]
-    return values
+    return InertialRows(model.pin_model, columns, values)
 
 
 def keep_inertial_rows(model: RobotModel, trajectory: Trajectory) -> None:
-    """Compute the inertial columns of a trajectory once and store them with it.
-
-    They are not stored if they are too many, or if compiled code computes them faster than they can
-    be read from memory.
-    """
+    """Store the inertial columns of a trajectory with it, unless they are many or compiled."""
     columns, samples = _inertial_support(model), len(trajectory.t)
     is_large = 8 * samples * sum(map(len, columns)) > _MOST_BYTES
     is_stored = kept_rows(model, trajectory) is not None
     if is_stored or is_large or choose_engine(model, samples, None) == COMPILED:
         return
-    values = inertial_columns(model, trajectory.q, trajectory.v, trajectory.a)
-    trajectory.derived["inertial rows"] = InertialRows(model.pin_model, columns, values)
+    rows = inertial_rows(model, trajectory.q, trajectory.v, trajectory.a)
+    trajectory.derived["inertial rows"] = rows
 
 
 def _inertial_support(model: RobotModel) -> tuple[Array, ...]:
@@ -128,8 +260,7 @@ class TrajectoryRows(RowSource):
     support: Array  # shape (n_rows, p), bool: False where row j is zero for every motion
     selected: Array  # indices of its columns among the p columns, shape (c,)
     engine: str  # name of the code that computes the regressor, as of ``choose_engine``
-    # its inertial columns if they are stored with the trajectory
-    inertial: InertialRows | None = None
+    inertial: InertialRows | None = None  # if they are stored with the trajectory
 
     @property
     def samples(self) -> int:
@@ -151,18 +282,19 @@ class TrajectoryRows(RowSource):
 
     def blocks(self, start: int, stop: int, segment: int | None = None) -> Iterator[list[Array]]:
         plan, segment = self._plan, segment or stop - start
-        length = _block_length(int(plan.first[-1]))
+        fitting = BLOCK_SIZE // int(plan.first[-1]) // _GROUP * _GROUP  # into the cache
+        length = max(_GROUP, min(BLOCK, fitting))
         out = np.empty((plan.first[-1], length))
-        motion = self.trajectory
+        motion, is_weighted = self.trajectory, bool((self.weights != 1.0).any())
         writer = (
-            CompiledWriter(self.model, self._tree, plan, out)
+            _CompiledWriter(self.model, self._tree, plan, out)
             if self.engine == COMPILED
             else _PinocchioWriter(self.model, plan, out, self.inertial)
         )
         for first in range(start, stop, _LOADED * length):
             last = min(first + _LOADED * length, stop)
             part = slice(first, last)
-            weights = self.weights[part] if self._is_weighted else None
+            weights = self.weights[part] if is_weighted else None
             values = trajectory_values(self.model.layout, motion, part)
             writer.load(motion, part, values, weights)
             ends = range(start + segment, last, segment)  # of segments
@@ -178,10 +310,6 @@ class TrajectoryRows(RowSource):
     @cached_property
     def _plan(self) -> RowPlan:
         return plan_rows(self.model.layout, [self.selected[columns] for columns in self.columns])
-
-    @cached_property
-    def _is_weighted(self) -> bool:
-        return bool((self.weights != 1.0).any())
 
 
 def trajectory_rows(
@@ -269,13 +397,51 @@ class _PinocchioWriter:
             out[places] = out[places] + values if is_added else values
 
 
+class _CompiledWriter:
+    """Writes blocks of rows into the same memory; one writer per thread."""
+
+    def __init__(self, model: RobotModel, tree: Tree, plan: RowPlan, out: Array) -> None:
+        self._model, self._tree, self._out = model, tree, out
+        self._places = _compiled_places(tree, plan)
+        self._ends = np.append(plan.drive_places, plan.torques)
+        self._plan, self._widths = plan, np.diff(plan.first)
+        self._root = np.zeros(out.shape[1])
+        self._work = tree.work_space()
+
+    def load(self, motion: Trajectory, part: slice, values: Array, weights: Array | None) -> None:
+        """Load the samples of the next blocks, and their drive columns: values (k, N)."""
+        q, v, a, tau = motion.q[part], motion.v[part], motion.a[part], motion.tau[part]
+        if self._model.free_flyer:  # the pose has one more entry than the twist
+            falling = in_base(q[:, 3:7], self._model.pin_model.gravity.linear)
+            base = np.vstack([v[:, :6].T, (a[:, :3] - falling).T, a[:, 3:6].T])
+            self._motion = own_motion(q[:, 1:], v, a, base)
+        else:
+            self._motion = own_motion(q, v, a)
+        values = values[self._plan.drive_numbers]
+        if (self._plan.ratios != 1.0).any():
+            values *= self._plan.ratios
+        self._values = np.array(np.vstack([values, tau.T]), order="C")  # as of ``own_motion``
+        self._weights = np.zeros((0, 0)) if weights is None else np.array(weights, float, order="C")
+
+    def write(self, start: int, stop: int) -> None:
+        """Write the rows of samples start to stop of those loaded, at most k."""
+        lanes, span = tree_lanes(), (start, stop)
+        lanes.inertial_rows(self._tree, self._places, self._motion, self._work, self._out, span)
+        lanes.finish_rows(
+            self._values, self._ends, self._widths, self._weights, self._root, self._out, span
+        )
+
+
+def _compiled_places(tree: Tree, plan: RowPlan) -> Array:
+    """Return the places of each body's columns in each of its rows, (B, D, 10); -1: none."""
+    table = np.full((len(plan.inertial), 10 * len(tree.parents)), -1)
+    for row, wanted, place in zip(table, plan.inertial, plan.places, strict=True):
+        row[wanted] = place
+    return tree.places(table)
+
+
 def _as_slice(places: Array) -> Array | slice:
     """Return consecutive places as a slice, for which writing is faster."""
     if len(places) and (np.diff(places) == 1).all():
         return slice(int(places[0]), int(places[-1]) + 1)
     return places
-
-
-def _block_length(columns: int) -> int:
-    """Return the samples per block, a multiple of 64, such that it fits in the cache."""
-    return max(_LANES, min(BLOCK, _BLOCK_SIZE // columns // _LANES * _LANES))

@@ -13,17 +13,24 @@ from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.dynamics.constraint_rows import ProjectedRows, loop_basis, mixed_rows, without_forces
-from robotid.dynamics.drive_columns import drive_values, friction_directions, instant_state
 from robotid.dynamics.problem import Block, Problem, RowSource
-from robotid.dynamics.rows import BLOCK, inertial_columns, kept_rows, trajectory_rows
+from robotid.dynamics.rows import (
+    BLOCK,
+    BLOCK_SIZE,
+    drive_motion,
+    drive_values,
+    friction_directions,
+    inertial_rows,
+    kept_rows,
+    remembered,
+    trajectory_rows,
+)
 from robotid.robot.closure import Chains
 from robotid.robot.drive_term import DriveMotion
 from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
 
 _DECADES = 3.0  # of speeds, at random states of a robot with nonlinear friction
-_INSTANTS = 32  # samples whose whole regressors are in memory together
-_BLOCK_SIZE = 2**19  # numbers per block of W, 4 MiB
 
 
 def joint_torque_regressor(
@@ -34,44 +41,26 @@ def joint_torque_regressor(
     direction: Array | None = None,
     memory: Array | None = None,
 ) -> Array:
-    """Return the regressor Y with tau = Y pi at each of N samples.
+    """Return the regressor Y with tau = Y pi at each of N samples, shape (N n_rows, p).
 
     The columns are those of the ten inertial parameters of each body, from Pinocchio, and then of
-    the drives: ``tau_j = Ia a_j + Fv v_j + Fc sign(v_j) + off``, likewise for couplings.
-
-    Args:
-        model: The robot.
-        q: Positions, shape (N, n) [rad, m].
-        v: Velocities, shape (N, n_rows) [rad/s, m/s].
-        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
-        direction: Directions of friction, shape (N, c); the signs of the speeds if None.
-        memory: Columns with internal state or load, shape (N, m); steady ones if None.
-
-    Returns:
-        Y, shape (N n_rows, p).
-
-    References:
-        Atkeson, An, Hollerbach (1986), Estimation of Inertial Parameters of Manipulator Loads and
-        Links; Carpentier et al. (2019), The Pinocchio C++ library.
+    the drives: ``tau_j = Ia a_j + Fv v_j + Fc sign(v_j) + off``, likewise for couplings. v and a
+    have shape (N, n_rows); directions (N, c) are the signs of the speeds if None, internal states
+    (N, m) steady ones. See Atkeson, An, Hollerbach (1986), Estimation of Inertial Parameters of
+    Manipulator Loads and Links; Carpentier et al. (2019), The Pinocchio C++ library.
     """
-    _check_motion(model, q, v, a)
-    Y = np.empty((len(q), model.n_rows, len(model.layout.names)))
-    size = model.layout.n_inertial
-    _write_inertial(model, q, v, a, Y[:, :, :size])
-    if memory is None and model.layout.remembering:
-        load = Y[:, model.n_rows - len(model.joints) :, :size] @ model.carried_by[:size]
-        memory = instant_state(model.layout, q, v, a, direction, load)
-    _write_drives(model, q, v, a, direction, memory, Y[:, :, size:])
+    wanted = (len(q), model.n_rows)
+    if v.shape != wanted or a.shape != wanted:
+        raise DataError(f"v and a have shapes {v.shape} and {a.shape}, wanted {wanted}")
+    for name, values in (("v", v), ("a", a)):
+        if not np.isfinite(values).all():
+            k, j = np.argwhere(~np.isfinite(values))[0]
+            row = model.row_names[j]
+            raise DataError(f"{name}[{k}] of {row} is {values[k, j]}, wanted a finite number")
+    Y = np.zeros((len(q), model.n_rows, len(model.layout.names)))
+    inertial_rows(model, q, v, a).write(slice(None), Y)
+    _write_drives(model, q, v, a, direction, memory, Y)
     return Y.reshape(len(q) * model.n_rows, -1)
-
-
-def carried_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
-    """Return the inertial columns of the bodies that affect each row, shape (N, columns).
-
-    For robots with many joints they are a tenth of the regressor.
-    """
-    _check_motion(model, q, v, a)
-    return np.ascontiguousarray(inertial_columns(model, q, v, a).T)
 
 
 def trajectory_regressor(
@@ -79,22 +68,19 @@ def trajectory_regressor(
 ) -> Array:
     """Return the regressor of N samples of a trajectory, with stored inertial columns if any."""
     m = trajectory if samples is None else trajectory.at(samples)
-    stored, layout = kept_rows(model, trajectory), model.layout
-    if stored is None or (m.memory is None and layout.remembering):
+    if (stored := kept_rows(model, trajectory)) is None:
         return joint_torque_regressor(model, m.q, m.v, m.a, m.direction, m.memory)
-    Y = np.zeros((len(m.t), model.n_rows, len(layout.names)))
+    Y = np.zeros((len(m.t), model.n_rows, len(model.layout.names)))
     stored.write(slice(None) if samples is None else samples, Y)
-    _write_drives(model, m.q, m.v, m.a, m.direction, m.memory, Y[:, :, layout.n_inertial :])
+    _write_drives(model, m.q, m.v, m.a, m.direction, m.memory, Y)
     return Y.reshape(len(m.t) * model.n_rows, -1)
 
 
 def mass_regressor(model: RobotModel, q: Array) -> Array:
     """Return the regressor of D(q, pi) = mass_regressor @ pi, shape (N, n_rows, n_rows, p).
 
-    With drives, column j is W(q, 0, e_j) - W(q, 0, 0), where gravity and offsets cancel.
-
-    References:
-        Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (11), (13).
+    With drives, column j is W(q, 0, e_j) - W(q, 0, 0), where gravity and offsets cancel. See
+    Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (11), (13).
     """
     N, n = len(q), model.n_rows
     still = np.zeros((N, n))
@@ -143,11 +129,7 @@ class InstantRegressor:
             for term, place in self._terms:
                 Y[rows, place] = term.column(motion)
             return Y[:, self._columns]
-        size, memory = layout.n_inertial, None
-        if layout.remembering:
-            load = Y[:, :size] @ model.carried_by[:size]
-            memory = instant_state(layout, q[None], v[None], a[None], None, load[None])
-        _write_drives(model, q[None], v[None], a[None], None, memory, Y[None, :, size:])
+        _write_drives(model, q[None], v[None], a[None], None, None, Y[None])
         return Y[:, self._columns]
 
 
@@ -177,7 +159,7 @@ def build_problem(
         source = ProjectedRows(own, trajectory.basis, weights)
         support = own.support.any(axis=0) & used
     samples = len(weights)
-    length = max(1, min(BLOCK, _BLOCK_SIZE // (model.n_rows * len(model.layout.names))))
+    length = max(1, min(BLOCK, BLOCK_SIZE // (model.n_rows * len(model.layout.names))))
 
     def stream() -> Iterator[Block]:
         m = trajectory
@@ -243,18 +225,6 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
     return without_forces(loop_basis(model, q), Y).reshape(W.shape)
 
 
-def _check_motion(model: RobotModel, q: Array, v: Array, a: Array) -> None:
-    """Refuse velocities and accelerations with a wrong shape, or not finite."""
-    wanted = (len(q), model.n_rows)
-    if v.shape != wanted or a.shape != wanted:
-        raise DataError(f"v and a have shapes {v.shape} and {a.shape}, wanted {wanted}")
-    for name, values in (("v", v), ("a", a)):
-        if not np.isfinite(values).all():
-            k, j = np.argwhere(~np.isfinite(values))[0]
-            row = model.row_names[j]
-            raise DataError(f"{name}[{k}] of {row} is {values[k, j]}, wanted a finite number")
-
-
 def _write_drives(
     model: RobotModel,
     q: Array,
@@ -262,23 +232,16 @@ def _write_drives(
     a: Array,
     direction: Array | None,
     memory: Array | None,
-    out: Array,
+    Y: Array,
 ) -> None:
-    """Write the columns of the drive parameters, shape (N, n_rows, drive)."""
-    layout, first = model.layout, model.n_rows - len(model.joints)
-    values = drive_values(layout, q, v, a, friction_directions(layout, v, direction), memory)
-    out[:, :first] = 0.0
-    np.multiply(layout.drive_loads, values.T[:, None], out=out[:, first:])
+    """Write the columns of the drive parameters beside those of the bodies, (N, n_rows, p).
 
-
-def _write_inertial(model: RobotModel, q: Array, v: Array, a: Array, out: Array) -> None:
-    """Write Pinocchio's joint-torque regressor at each sample, shape (N, n_rows, 10 bodies)."""
-    pin_model, G = model.pin_model, model.velocity_map
-    data, regressor = pin_model.createData(), pin.computeJointTorqueRegressor
-    is_plain = np.array_equal(G, np.eye(len(G)))
-    if not is_plain:
-        v, a = v @ G.T, a @ G.T  # (N, nv)
-    instants = zip(out, np.ascontiguousarray(model.configurations(q)), v, a, strict=True)
-    for Y, q_k, v_k, a_k in instants:
-        Y_k = regressor(pin_model, data, q_k, v_k, a_k)
-        Y[:] = Y_k if is_plain else G.T @ Y_k  # tau = G^T tau_pinocchio
+    Without ``memory``, internal states have their steady values under the torque of the bodies.
+    """
+    layout, size, first = model.layout, model.layout.n_inertial, model.n_rows - len(model.joints)
+    signs = friction_directions(layout, v, direction)
+    if memory is None and layout.remembering:
+        load = Y[:, first:, :size] @ model.carried_by[:size]
+        memory = remembered(layout, drive_motion(layout, q, v, a, signs, load))
+    values = drive_values(layout, q, v, a, signs, memory)
+    np.multiply(layout.drive_loads, values.T[:, None], out=Y[:, first:, size:])

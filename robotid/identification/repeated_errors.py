@@ -37,7 +37,7 @@ from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.constraint_rows import constraint_forces, contact_links, without_forces
 from robotid.dynamics.factors import Triangle, join, triangle_of
 from robotid.dynamics.prediction import predict
-from robotid.dynamics.used_rows import base_problem
+from robotid.dynamics.prepared_logs import base_problem
 from robotid.estimation.estimators import WLS
 from robotid.estimation.fitting.recorded import Recordings, RepeatedErrors
 from robotid.estimation.fitting.survey import Rows, SurveyedLog

@@ -30,10 +30,6 @@ INERTIAL_TERMS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "
 PAPER_TERMS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mcx", "mcy", "mcz", "m")
 
 
-def _load_ratios(table: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
-    return tuple((joint, float(ratio)) for joint, ratio in table.items())
-
-
 @dataclass(frozen=True)
 class Coupling(Settings):
     """A drive that moves with several joints, at the speed w = sum_j ratio_j v_j.
@@ -47,7 +43,7 @@ class Coupling(Settings):
         MISSING,
         "ratio by joint [-]; in Python, pairs",
         reads=Entries(dict, (int, float)),
-        load=_load_ratios,
+        load=lambda table: tuple((joint, float(ratio)) for joint, ratio in table.items()),
         dump=dict,
     )
     replaces: bool = setting(

@@ -71,7 +71,9 @@ def _inertial_spread(model: RobotModel) -> Array:
 
 def _drive_spread(model: RobotModel, rms: Array) -> Array:
     first = model.n_rows - len(model.joints)
-    tau, v, a = (_positive(row[first:]) for row in rms)
+    rms = rms[:, first:]
+    largest = rms.max(axis=1, keepdims=True)
+    tau, v, a = np.maximum(rms, np.where(largest > 0.0, 1e-3 * largest, 1.0))  # never 0
     carried = carried_inertia(model)
     q = np.linspace(-np.pi, np.pi, _POSITIONS, endpoint=False)[:, None]
     typical = DriveMotion(*np.broadcast_arrays(q, v, a, np.ones(()), tau, tau * a / v))
@@ -82,11 +84,6 @@ def _drive_spread(model: RobotModel, rms: Array) -> Array:
         rows = [model.joints.index(joint) for joint, _ in model.layout.drives[d].ratios]
         spread.append((np.maximum(carried, alone) if term.is_inertia else alone)[rows].mean())
     return np.array(spread)
-
-
-def _positive(rms: Array) -> Array:
-    """Return the root mean square of each column, never 0."""
-    return np.maximum(rms, 1e-3 * rms.max() if rms.max() > 0 else 1.0)
 
 
 def with_assumed_inertials(model: RobotModel) -> RobotModel:

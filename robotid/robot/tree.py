@@ -200,7 +200,11 @@ def _joint(element: ET.Element, links: dict[str, ET.Element], where: str) -> Joi
         for key in keys
         if limit is not None and limit.get(key) is not None
     }
-    mimic = _mimic(element.find("mimic"), at)
+    mimic, leader = None, element.find("mimic")
+    if leader is not None:
+        (multiplier,) = read_numbers(leader, "multiplier", f"{at}:", (1.0,))
+        (offset,) = read_numbers(leader, "offset", f"{at}:", (0.0,))
+        mimic = leader.get("joint", ""), multiplier, offset
     return Joint(
         name, kind, ends["parent"], ends["child"], **bounds,
         mimic=mimic, xyz=xyz, rpy=rpy, axis=direction,
@@ -214,14 +218,6 @@ def _pose(element: ET.Element, at: str) -> tuple[tuple[float, ...], tuple[float,
         raise ModelError(f"{at} origin has quat_xyzw, wanted rpy; convert it to rpy angles")
     none = (0.0, 0.0, 0.0)
     return read_numbers(origin, "xyz", at, none), read_numbers(origin, "rpy", at, none)
-
-
-def _mimic(element: ET.Element | None, at: str) -> tuple[str, float, float] | None:
-    if element is None:
-        return None
-    (multiplier,) = read_numbers(element, "multiplier", f"{at}:", (1.0,))
-    (offset,) = read_numbers(element, "offset", f"{at}:", (0.0,))
-    return element.get("joint", ""), multiplier, offset
 
 
 def _root(links: tuple[str, ...], joints: tuple[Joint, ...], where: str) -> str:

@@ -7,7 +7,6 @@ import logging
 import math
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
 from decimal import Decimal
 from itertools import chain
 from pathlib import Path
@@ -172,14 +171,10 @@ def _check_bounds(robot: ET.Element, where: str) -> None:
                 f"{where}: elements are nested {depth} levels deep, wanted at most {DEEPEST}; a "
                 "URDF needs six"
             )
-    for element, key, text in _attributes(robot):
+    owners = chain([robot], *(o.iter() for tag in ("link", "joint") for o in robot.iterfind(tag)))
+    for element, key, text in ((x, *item) for x in owners for item in x.items()):
         if len(text) > LONGEST_PATH:
             raise ModelError(
                 f"{where}: <{element.tag[:80]}>: {key[:80]} has {len(text)} characters, wanted at "
                 f"most {LONGEST_PATH}; it starts with {_shown(text)}"
             )
-
-
-def _attributes(robot: ET.Element) -> Iterator[tuple[ET.Element, str, str]]:
-    owners = chain([robot], *(o.iter() for tag in ("link", "joint") for o in robot.iterfind(tag)))
-    return ((element, key, text) for element in owners for key, text in element.items())

@@ -15,42 +15,19 @@ from robotid.cli import main
 from robotid.data.files.read import read_log, write_log
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.robot.examples import example_urdf
-from robotid.robot.model import RobotModel
 
-URDF = str(example_urdf("ur5_robot.urdf"))
 ARM = str(PLANAR / "planar_2r.urdf")
 PLAIN = ("--friction", "viscous+coulomb", "--no-report")
-NOISE = np.array([0.5, 0.5, 0.25, 0.1, 0.1, 0.05])  # [N m]
 
 
-@pytest.fixture(scope="module")
-def logs(tmp_path_factory):
-    """A folder with two motions of a UR5 that its URDF does not describe."""
-    folder = tmp_path_factory.mktemp("logs")
-    model = RobotModel.from_urdf(URDF)
-    rng = np.random.default_rng(0)
-    for name in ("fit", "keep"):
-        log = exact_log(model, truth(model), rng, samples=1500, rate=100.0, noise=NOISE)
-        write_log(log, folder / f"{name}.csv")
-    return folder
-
-
-@pytest.fixture(scope="module")
-def identified(logs, tmp_path_factory):
-    out = tmp_path_factory.mktemp("identified")
-    words = ["identify", URDF, str(logs / "fit.csv"), "--validate", str(logs / "keep.csv")]
-    assert main([*words, "--out", str(out)]) == 0
-    return out
-
-
-def test_the_written_urdf_predicts_what_the_fit_predicts(identified, logs, capsys):
-    result = json.loads((identified / "result.json").read_text())
-    assert (
-        main(["validate", str(identified / "result.json"), str(logs / "keep.csv"), "--json"]) == 0
-    )
+def test_the_written_urdf_predicts_what_the_fit_predicts(arm_logs, tmp_path, capsys):
+    fit, keep = (str(arm_logs / f"{name}.csv") for name in ("fit", "keep"))
+    assert main(["identify", ARM, fit, "--validate", keep, "--out", str(tmp_path)]) == 0
+    result = json.loads((tmp_path / "result.json").read_text())
+    capsys.readouterr()
+    assert main(["validate", str(tmp_path / "result.json"), keep, "--json"]) == 0
     again = json.loads(capsys.readouterr().out)
-    assert again["predicted_with"] == "ur5_robot.identified.urdf"
+    assert again["predicted_with"] == "planar_2r.identified.urdf"
     for joint, before in result["validation"][0]["per_joint"].items():
         after = again["validation"][0]["per_joint"][joint]
         assert after["rmse"] == pytest.approx(before["rmse"], rel=1e-6)

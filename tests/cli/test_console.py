@@ -15,21 +15,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.paths import ROOT
-from helpers.synthetic import exact_log, truth
 
 from robotid.base.findings import Finding
 from robotid.base.typing import STAGES
 from robotid.cli import doctor, main
-from robotid.data.files.read import write_log
-from robotid.robot.model import RobotModel
 
 ARM = str(ROOT / "urdf" / "planar_2r.urdf")
-
-
-@pytest.fixture(scope="module")
-def log():
-    model, rng = RobotModel.from_urdf(ARM), np.random.default_rng(0)
-    return exact_log(model, truth(model), rng, samples=900, rate=100.0, noise=0.1)
 
 
 def on_a_terminal(words, columns, **environment):
@@ -157,16 +148,15 @@ CLOSED = {"no output": ">&-", "no errors": "2>&-", "neither": ">&- 2>&-"}
 
 
 @pytest.mark.parametrize("name", CLOSED)
-def test_closed_streams_change_neither_files_nor_the_code(log, tmp_path, name):
+def test_closed_streams_change_neither_files_nor_the_code(arm_logs, tmp_path, name):
     """The next file that is opened gets the number of a closed stream: no word may get into it."""
-    write_log(log, tmp_path / "log.csv")
-    words = ["convert", tmp_path / "log.csv", tmp_path / "out.npz"]
+    words = ["convert", arm_logs / "fit.csv", tmp_path / "out.npz"]
     close = CLOSED[name]
     command = shlex.join([sys.executable, "-m", "robotid", *map(str, words)])
     done = subprocess.run(f"{command} {close}", shell=True, capture_output=True, check=False)
     assert (done.returncode, done.stderr) == (0, b"")
-    assert len(np.load(tmp_path / "out.npz")["time"]) == 900
-    missing = command.replace("log.csv", "none.csv")
+    assert len(np.load(tmp_path / "out.npz")["time"]) == 800
+    missing = command.replace("fit.csv", "none.csv")
     done = subprocess.run(f"{missing} {close}", shell=True, capture_output=True, check=False)
     assert done.returncode == 1
     assert (b"there is no log file" in done.stderr) == (name == "no output")

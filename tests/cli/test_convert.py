@@ -10,8 +10,7 @@ from robotid.base.exceptions import DataError
 from robotid.base.files import write_text
 from robotid.cli import main
 from robotid.cli.convert import convert
-from robotid.data.files.formats import open_table, write_columns
-from robotid.data.files.read import read_log
+from robotid.data.files.read import open_table, read_log, write_columns
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource
 
@@ -44,18 +43,18 @@ def test_a_bag_becomes_a_table_of_standard_names(tmp_path, log, bag, suffix):
     target = tmp_path / f"run{suffix}"
     done = convert(bag, target, source=LogSource(topic="/arm"))
     standard = [f"{kind}_{joint}" for kind in ("q", "dq", "tau") for joint in JOINTS]
-    assert (done.columns, done.joints) == (("time", *standard), JOINTS)
-    assert (done.path, done.samples, done.ignored) == (str(target), 60, ())
+    assert done == {"path": str(target), "samples": 60, "columns": ["time", *standard],
+                    "joints": [*JOINTS], "ignored": [], "local": False}  # fmt: skip
     assert_same(read_log(target, JOINTS), log)
 
 
 def test_joints_are_chosen_renamed_and_effort_may_be_current(tmp_path, log, bag):
     source = LogSource(topic="/arm", joints={"joint_2": "elbow"}, effort="current")
     done = convert(bag, tmp_path / "run.csv", joints=["joint_2"], source=source)
-    assert done.columns == ("time", "q_joint_2", "dq_joint_2", "current_joint_2")
+    assert done["columns"] == ["time", "q_joint_2", "dq_joint_2", "current_joint_2"]
     back = read_log(tmp_path / "run.csv", ["joint_2"], gains={"joint_2": 2.0})
     np.testing.assert_array_equal(back.tau[:, 0], 2 * log.tau[:, 1])
-    assert done.ignored == ()
+    assert done["ignored"] == []
 
 
 @pytest.mark.parametrize(
@@ -87,9 +86,9 @@ def test_columns_of_base_contacts_and_forces_are_kept(tmp_path, log):
     table |= {name: k + log.t for k, name in enumerate([*kept, *lost])}
     write_columns(table, tmp_path / "run.parquet")
     done = convert(tmp_path / "run.parquet", tmp_path / "run.csv", joints=["elbow"])
-    assert done.columns == ("time", "q_elbow", *kept)
-    assert done.ignored == tuple(lost)
-    assert not done.local
+    assert done["columns"] == ["time", "q_elbow", *kept]
+    assert done["ignored"] == lost
+    assert not done["local"]
     back = open_table(tmp_path / "run.csv", LogSource()).read(kept)
     for k, name in enumerate(kept):
         np.testing.assert_array_equal(back[name], k + log.t)

@@ -6,14 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from helpers.paths import ROOT
-from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
-from robotid.data.files.read import write_log
-from robotid.robot.model import RobotModel
 
 URDF = str(ROOT / "urdf" / "planar_2r.urdf")
 OUTPUTS = [
@@ -23,11 +19,8 @@ OUTPUTS = [
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory):
-    path = tmp_path_factory.mktemp("log") / "fit.csv"
-    model, rng = RobotModel.from_urdf(URDF), np.random.default_rng(0)
-    write_log(exact_log(model, truth(model), rng, samples=1000, rate=100.0, noise=0.1), path)
-    return str(path)
+def log(arm_logs):
+    return str(arm_logs / "fit.csv")
 
 
 @pytest.fixture(scope="module")

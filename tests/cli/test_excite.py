@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from robotid.cli import excite, main
-from robotid.data.files.formats import open_table
+from robotid.data.files.read import open_table
 from robotid.data.signal_settings import LogSource
 from robotid.design.clearance import Box
 from robotid.design.excitation import MotionSettings

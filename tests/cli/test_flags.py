@@ -6,10 +6,8 @@ from pathlib import Path
 import pytest
 
 from robotid.base.exceptions import SettingsError
-from robotid.cli import doctor, identify, preview, track
-from robotid.cli.flags import job_from_flags, source_words
-from robotid.cli.job import job_from_settings
-from robotid.cli.parser import CommandParser
+from robotid.cli import CommandParser, doctor, identify, preview, track
+from robotid.cli.job import job_from_flags, job_from_settings, source_words
 from robotid.data.signal_settings import LogSource, SignalSettings
 
 

@@ -16,6 +16,7 @@ from robotid.cli import fleet, main
 from robotid.cli.fleet import read_fleet, run_fleet
 from robotid.data.files.read import write_log
 from robotid.estimation.variation.variation import between_units
+from robotid.estimation.work_plan import WorkPlan
 from robotid.robot.model import RobotModel
 
 URDF = ROOT / "urdf" / "planar_2r.urdf"
@@ -43,7 +44,7 @@ def table(tmp_path_factory):
 @pytest.fixture(scope="module")
 def done(table, tmp_path_factory):
     folder = tmp_path_factory.mktemp("done")
-    return folder, run_fleet(read_fleet(table), folder)
+    return folder, run_fleet(read_fleet(table), folder, plan=WorkPlan())
 
 
 def rows_of(folder, **wanted):
@@ -99,7 +100,7 @@ def test_units_with_the_same_inputs_are_kept_and_new_logs_added(table, done, tmp
         fleet, "identify_unit", lambda unit, threads: repeated.append(unit.unit) or first(unit, 1)
     )
     shutil.copytree(done[0], tmp_path / "own")
-    same = run_fleet(units, tmp_path / "own", resume=True)
+    same = run_fleet(units, tmp_path / "own", plan=WorkPlan(), resume=True)
     assert same == done[1]
     assert repeated == ["a", "d"]  # with a failure
     for name in FILES:
@@ -111,16 +112,16 @@ def test_units_with_the_same_inputs_are_kept_and_new_logs_added(table, done, tmp
         extra,
         replace(units[1], unit="loaded", logs=((units[1].logs[0][0], 2.0),)),
     ]
-    found = run_fleet(changed, tmp_path / "own", resume=True)
+    found = run_fleet(changed, tmp_path / "own", plan=WorkPlan(), resume=True)
     assert repeated == ["c", "loaded"]
     assert found["logs"] == 4
-    run_fleet(changed, tmp_path / "whole")
+    run_fleet(changed, tmp_path / "whole", plan=WorkPlan())
     for name in FILES:
         own = (tmp_path / "own" / name).read_bytes()
         assert own == (tmp_path / "whole" / name).read_bytes()
     repeated.clear()
     monkeypatch.setattr(fleet, "code_versions", lambda: {"numpy": "0.1"})
-    run_fleet(units[1:2], tmp_path / "own", resume=True)
+    run_fleet(units[1:2], tmp_path / "own", plan=WorkPlan(), resume=True)
     assert repeated == ["b"]
 
 

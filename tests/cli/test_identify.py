@@ -63,23 +63,10 @@ def test_a_file_in_place_of_the_folder_is_refused_before_the_fit(arm, tmp_path):
         run_job(job, tmp_path / "out")
 
 
-@pytest.fixture
-def logs(rng, tmp_path):
-    """Two logs of a robot; `spoil` changes both."""
-
-    def write(model, spoil=lambda log: log):
-        found = []
-        for name in ("run.csv", "kept.csv"):
-            log = exact_log(model, truth(model), rng, samples=1500, rate=100.0, noise=0.2)
-            found.append(spoil(log))
-            write_log(found[-1], tmp_path / name)
-        return found
-
-    return write
-
-
-def test_a_result_of_reversed_torques_is_no_urdf_and_exit_code_1(arm, logs, tmp_path, capsys):
-    logs(arm, lambda log: replace(log, tau=-log.tau))
+def test_a_result_of_reversed_torques_is_no_urdf_and_exit_code_1(arm, rng, tmp_path, capsys):
+    for name in ("run.csv", "kept.csv"):
+        log = exact_log(arm, truth(arm), rng, samples=1500, rate=100.0, noise=0.2)
+        write_log(replace(log, tau=-log.tau), tmp_path / name)
     files = [arm.tree.path, str(tmp_path / "run.csv"), "--validate", str(tmp_path / "kept.csv")]
     command = ["identify", *files, "--out", str(tmp_path / "out"), "--json", *PLAIN]
     assert main(command) == 1

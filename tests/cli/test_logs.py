@@ -8,7 +8,8 @@ import pytest
 
 from robotid.base.exceptions import SettingsError
 from robotid.cli.job import Job, LogEntry
-from robotid.cli.logs import locked_as_logged, units_of_logs
+from robotid.cli.logs import locked_as_logged, survey_logs, units_of_logs
+from robotid.robot.drives import DRIVE_TERMS
 
 HAND = """<robot name="hand"><link name="base"/><link name="a"/><link name="b"/><link name="c"/>
 <link name="d"/>
@@ -51,8 +52,18 @@ def test_a_joint_is_locked_at_the_median_of_all_logs_if_it_stands_there_in_each(
     assert {log.model for log in (*fitted, *kept)} == {own}
     job, *_ = locked_as_logged(hand, model, [first, far], [second])
     assert job.locked == {"jc": pytest.approx(0.3001)}
+    leader = replace(hand, locked={"jc": 0.0})  # the position of jd follows from it
+    assert leader.placed(leader.model()) == ("jc", "jd")
     stated = replace(hand, locked={"jc": 0.0, "jd": 0.2})
     assert locked_as_logged(stated, stated.model(), [first], [second])[-1] == ()
+
+
+@pytest.mark.parametrize(("dynamics", "is_whole"), [("full", False), ("static", True)])
+def test_logs_of_poses_are_read_whole(arm, arm_logs, dynamics, is_whole):
+    entries = (LogEntry(arm_logs / "fit.csv"), LogEntry(arm_logs / "keep.csv"))
+    job = Job(Path(arm.tree.path), model_dynamics=dynamics, rows_in_memory=900, terms=DRIVE_TERMS)
+    groups = survey_logs(job, job.model(), *((entry,) for entry in entries))  # 800 rows each
+    assert [log.is_in_memory for (log,) in groups] == [is_whole] * 2
 
 
 @pytest.mark.parametrize("at", [0, 1, 2])

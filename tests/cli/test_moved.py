@@ -29,7 +29,6 @@ def test_a_renamed_project_works(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     capsys.readouterr()
     for words in (
-        ["report", result],
         ["validate", result + "/result.json", str(new / "logs/later.parquet")],
         ["preview", urdf, str(new / "logs/later.csv"), "--given", result],
         ["replay", urdf, str(new / "logs/later.csv"), result],
@@ -43,5 +42,6 @@ def test_a_renamed_project_works(tmp_path, monkeypatch, capsys):
     ]
     assert "old" in json.loads((new / "out" / "result.json").read_text())["settings"]["urdf"]
     (new / "logs" / "fit.csv").write_text("another log")
-    assert main(["report", result]) == 1
-    assert f"log '{old / 'logs/fit.csv'}'" in " ".join(capsys.readouterr().err.split())
+    assert main(["preview", urdf, str(new / "logs/later.csv"), "--given", result]) == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"{old / 'logs/fit.csv'}, a fitted log of" in said

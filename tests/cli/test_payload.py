@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +12,10 @@ from robotid.base.exceptions import SettingsError
 from robotid.base.files import file_sha256
 from robotid.cli import main
 from robotid.cli.identify import run_job
-from robotid.cli.job import job_from_settings
+from robotid.cli.job import Job, LogEntry, job_from_settings
+from robotid.cli.logs import job_of_result
 from robotid.cli.payload import stated_masses
-from robotid.data.files.formats import write_columns
-from robotid.data.files.read import write_log
+from robotid.data.files.read import write_columns, write_log
 from robotid.output.files.result_file import load_result, stated_scale_check
 from robotid.output.report.next_steps import Origin, next_steps
 from robotid.robot.bodies import link_transfer
@@ -72,6 +73,10 @@ def test_a_log_and_a_result_are_references_alike(files, capsys):
     error = np.array(payload["com"]) - LOAD[1:4] / LOAD[0]
     assert (np.abs(error) < 4 * np.array(payload["com_std_error"])).all()
     assert "gains" not in found[0]
+    stated = Job(Path("other.urdf"), identification=(LogEntry(files / "loaded.csv"),))
+    job, references = job_of_result(stated, files / "out", "")
+    assert (job.urdf, job.identification) == (stated.urdf, stated.identification)
+    assert [entry.path for entry in references] == [files / "bare.csv"]
 
 
 def test_a_job_states_a_check_of_the_scale_which_its_result_has(files):

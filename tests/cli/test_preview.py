@@ -9,8 +9,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.cli import main
 from robotid.cli.identify import run_job
 from robotid.cli.job import job_from_settings
-from robotid.data.files.formats import write_columns
-from robotid.data.files.read import write_log
+from robotid.data.files.read import write_columns, write_log
 from robotid.robot.examples import example_urdf
 
 NOISE = np.array([2.0, 3.0, 1.0, 0.3, 0.2, 0.1])  # [N m]

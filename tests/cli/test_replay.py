@@ -10,15 +10,17 @@ import pinocchio as pin
 import pytest
 from helpers.commanded_results import drive_entries, written_result
 from helpers.mujoco_plant import plant, recorded
+from helpers.paths import ROOT
 from helpers.replay_data import leave_out_meshes, shown
 from helpers.synthetic import exact_log, payload_log, truth
 
 from robotid.base.exceptions import DataError
 from robotid.cli import main
-from robotid.cli.replay import replay_identified
-from robotid.data.files.formats import write_columns
-from robotid.data.files.read import write_log
+from robotid.cli.replay import _of_joints, replay_identified
+from robotid.data.files.read import open_table, write_columns, write_log
+from robotid.data.signal_settings import LogSource
 from robotid.output.files.result_file import load_result
+from robotid.output.viewer.replays import Torques
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -137,6 +139,26 @@ def test_a_track_gives_parameters_over_time_and_marks_the_load(panda, tmp_path, 
     np.testing.assert_allclose(data["bands"]["values"][-1], wanted, rtol=1e-6)
 
 
+def test_a_track_has_converged_at_the_first_of_its_rows_that_say_so(tmp_path):
+    urdf, out = ROOT / "urdf" / "planar_2r.urdf", tmp_path / "track"
+    arm, rng = RobotModel.from_urdf(urdf), np.random.default_rng(0)
+    write_log(exact_log(arm, truth(arm), rng, samples=1500, noise=1.0), tmp_path / "log.csv")
+    assert main(["track", str(urdf), str(tmp_path / "log.csv"), "--out", str(out)]) == 0
+    track = json.loads((out / "track.json").read_text())
+    history = open_table(out / track["history"], LogSource()).read(["time", "converged"])
+    first, *later = history["time"][history["converged"] > 0]
+    assert track["converged_at"] == first > history["time"][0]
+    assert later
+
+
+def test_torques_of_a_floating_base_are_not_those_of_its_joints():
+    model = RobotModel.from_urdf(example_urdf("solo12.urdf"), free_flyer=True)
+    rows = np.arange(18.0) + np.zeros((3, 1))
+    torques = _of_joints(Torques(np.arange(3.0), rows, {"identified": -rows}), model)
+    np.testing.assert_array_equal(torques.measured, rows[:, 6:])
+    np.testing.assert_array_equal(torques.predicted["identified"], -rows[:, 6:])
+
+
 def test_a_base_is_where_the_log_says_or_said_to_be_held(tmp_path, capsys):
     urdf = example_urdf("solo12.urdf")
     model = RobotModel.from_urdf(urdf)
@@ -175,7 +197,10 @@ def test_a_base_is_where_the_log_says_or_said_to_be_held(tmp_path, capsys):
     capsys.readouterr()
     base[:, 3:] *= 0.5
     assert play(np.column_stack([rows, base]), [*columns, *names]) is None
-    assert "log.csv: base_qx to base_qw is not a unit quaternion" in capsys.readouterr().err
+    assert (
+        "log.csv: the quaternion of the base has length 0.5 in row 0, wanted 1"
+        in capsys.readouterr().err
+    )
 
 
 def test_a_motion_without_torques_plays_and_marks_where_it_uses_the_most_of_limits(folder):

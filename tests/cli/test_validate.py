@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
+from robotid.base.findings import Finding
 from robotid.cli.identify import run_job
 from robotid.cli.job import job_from_settings
 from robotid.cli.validate import validate
@@ -92,6 +93,22 @@ def test_faults_of_the_new_log_lead_its_verdict(here):
     found = verdict(folder, replace(other, v=v))
     assert found["status"] == "poor"
     assert "dq_joint_2 is 0.5 times d(q)/dt" in found["reasons"][0]
+
+
+def test_warnings_are_those_of_the_result_and_findings_those_of_the_new_log(here, monkeypatch):
+    """A motion that its own validation log repeated says nothing of another log."""
+    folder, _, other = here
+    path = folder / "out" / "result.json"
+    content = json.loads(path.read_text())
+    warned = [{"code": code, "joint": "", "message": code} for code in ("repeated_motion", "drift")]
+    content["verdict"]["warnings"] = warned
+    path.write_text(json.dumps(content))
+    for name, status in (("run.csv", "usable"), ("again.csv", "poor")):
+        fault = Finding("torque_sign", "error", f"{name}: joint_1", "the torque is reversed")
+        monkeypatch.setattr("robotid.cli.validate.diagnose", lambda *_, f=fault: [f])
+        found = verdict(folder, other)
+        assert found["status"] == status, found["reasons"]
+        assert [warning["code"] for warning in found["warnings"]] == ["drift"]
 
 
 def test_of_two_logs_the_one_that_was_fitted_shows_no_prediction_and_the_other_does(here):

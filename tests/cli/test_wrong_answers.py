@@ -79,18 +79,22 @@ def here(tmp_path, ur5, capsys):
     return Workplace(tmp_path, ur5, log, capsys)
 
 
-def nan_torque(here):
+def cell(column, text):
+    """A case with one cell of the log changed."""
+
     def change(names, cells):
-        cells[17][names.index("tau_elbow_joint")] = "nan"
+        cells[17][names.index(column)] = text
 
-    return here.refused("identify", URDF, here.table(change))
+    return lambda here: here.refused("identify", URDF, here.table(change))
 
 
-def nan_position(here):
-    def change(names, cells):
-        cells[17][names.index("q_elbow_joint")] = ""
+def stamps(*rows):
+    """A case whose rows 8 and 9 have the stamps of others."""
 
-    return here.refused("identify", URDF, here.table(change))
+    def change(_, cells):
+        cells[8][0], cells[9][0] = (cells[row][0] for row in rows)
+
+    return lambda here: here.refused("identify", URDF, here.table(change))
 
 
 def swapped_torques(here):
@@ -107,20 +111,6 @@ def degrees(here):
 
 def milliseconds(here):
     return here.refused("identify", URDF, here.write(replace(here.log, t=1000 * here.log.t)))
-
-
-def swapped_stamps(here):
-    def change(names, cells):
-        cells[8][0], cells[9][0] = cells[9][0], cells[8][0]
-
-    return here.refused("identify", URDF, here.table(change))
-
-
-def duplicate_stamp(here):
-    def change(names, cells):
-        cells[9][0] = cells[8][0]
-
-    return here.refused("identify", URDF, here.table(change))
 
 
 def few_rows(here):
@@ -264,13 +254,13 @@ def pooled_figure(here):
 
 
 CASES = {
-    "one NaN torque sample": nan_torque,
-    "a position that is missing": nan_position,
+    "one NaN torque sample": cell("tau_elbow_joint", "nan"),
+    "a position that is missing": cell("q_elbow_joint", ""),
     "two torque columns swapped": swapped_torques,
     "degrees for radians": degrees,
     "time in milliseconds": milliseconds,
-    "two time stamps swapped": swapped_stamps,
-    "a time stamp twice": duplicate_stamp,
+    "two time stamps swapped": stamps(9, 8),
+    "a time stamp twice": stamps(8, 8),
     "fewer rows than parameters": few_rows,
     "a torque column too many": extra_torque,
     "a misspelt setting": misspelt_setting,

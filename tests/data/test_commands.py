@@ -9,8 +9,7 @@ from robotid.base.exceptions import DataError
 from robotid.data.files.columns import quantity_of
 from robotid.data.files.read import read_log, read_logs
 from robotid.data.log import Log
-from robotid.data.signal_settings import LogUnits
-from robotid.data.transmission import Transmission
+from robotid.data.signal_settings import LogUnits, Transmission
 
 JOINTS = ("shoulder", "elbow")
 DEGREES = LogUnits(angle="deg")

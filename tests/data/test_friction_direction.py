@@ -7,7 +7,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import _acting, acting_directions, process
-from robotid.dynamics.drive_columns import friction_speeds
+from robotid.dynamics.rows import friction_speeds
 from robotid.dynamics.torque import build_problem, joint_torque_regressor
 from robotid.estimation.fitting.survey import hold_log
 from robotid.robot.examples import example_urdf

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.data.files.formats import write_columns
-from robotid.data.files.read import read_log
-from robotid.data.signal_settings import LogUnits
-from robotid.data.transmission import Transmission
+from robotid.data.files.read import read_log, write_columns
+from robotid.data.signal_settings import LogUnits, Transmission
 
 JOINTS = ("shoulder", "elbow", "wrist")
 # the last motor turns with the last two joints

@@ -1,3 +1,5 @@
+"""Multipliers of limits and distances: cost, slopes and growth."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -5,7 +7,15 @@ import pytest
 
 from robotid.base.exceptions import SettingsError
 from robotid.design.clearance import Box, Clearance
-from robotid.design.design import DesignedMotion, Designer, FourierBasis, Multipliers, State
+from robotid.design.design import (
+    SOFT,
+    SPARE,
+    DesignedMotion,
+    Designer,
+    FourierBasis,
+    Multipliers,
+    State,
+)
 from robotid.design.limits import LIMITS, MotionLimits
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
@@ -160,3 +170,27 @@ def test_motions_begin_and_end_at_rest_and_their_derivatives_are_true(rng):
     np.testing.assert_allclose((q, v, a), D[:3] @ C)
     with pytest.raises(SettingsError, match="harmonics is 1, wanted 2 or more"):
         FourierBasis(5.0, 1)
+
+
+def test_costs_are_those_of_the_augmented_lagrangian_and_slopes_their_derivatives(rng):
+    used, aim = rng.normal(size=(6, 5, 2)), np.array([[0.02], [0.1], [0.05]])
+    distance = aim + 0.03 * rng.normal(size=(3, 5))
+    limits, distances = rng.uniform(0, 2, used.shape), rng.uniform(0, 2, distance.shape)
+    own = Multipliers(2.5, limits, distances)
+    cases = (
+        (own.of_limits(used), used**2 / (1 - SPARE) ** 2 - 1.0, limits),
+        (own.of_distances(distance, aim), (aim - distance) / SOFT, distances),
+    )
+    for (cost, slopes), over, known in cases:
+        pushed = np.maximum(known + 2.5 * over, 0.0)
+        assert cost == pytest.approx(((pushed**2 - known**2) / 5.0).sum())
+        np.testing.assert_allclose(slopes, pushed)
+        assert 0 < (pushed == 0.0).sum() < pushed.size
+    raised = own.raised(used, distance, aim)
+    assert raised.weight == 2.5
+    np.testing.assert_allclose(raised.limits, own.of_limits(used)[1])
+    np.testing.assert_allclose(raised.distances, own.of_distances(distance, aim)[1])
+    assert own.raised(used, None, aim).distances == 0.0
+    edge = own.distance_without_cost(aim)
+    assert own.of_distances(edge, aim)[1] == pytest.approx(np.zeros((3, 5)), abs=1e-12)
+    assert (own.of_distances(edge - 1e-6, aim)[1] > 0).all()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from robotid.data.files.formats import open_table
+from robotid.data.files.read import open_table
 from robotid.data.signal_settings import LogSource
 from robotid.design.design import DesignedMotion, FourierBasis
 from robotid.design.excitation import write_motion

@@ -59,6 +59,10 @@ def test_planar_arm_without_and_with_gravity(tmp_path):
     assert count(path, gravity=(-9.81, 0.0, 0.0)) == 6
 
 
+def test_a_static_model_has_the_moments_that_gravity_loads_alone():
+    assert count(example_urdf("ur10_robot.urdf"), dynamics="static") == 10  # two of five joints
+
+
 def test_armature_adds_what_the_literature_says(ur5, panda):
     # UR: 36 + 4 = 40, Panda: 43 + 5 = 48, the rest is grouped with link inertias
     for model, expected in ((ur5, 40), (panda, 48)):
@@ -122,19 +126,6 @@ def test_groups_read_like_formulas():
     W = np.column_stack([W, 0.5 * W[:, 0] - W[:, 1]])
     mapping = base_mapping(W, ("a.Izz", "b.m", "c.m"), preference=np.array([1.0, 1.0, 0.1]))
     assert mapping.expressions == ("a.Izz + 0.5 c.m", "b.m - c.m")
-
-
-def test_words_tell_what_stands_alone_in_sums_or_never():
-    # columns a, 2 a + b, 0: of the first and second only sums, of the third nothing
-    W = np.random.default_rng(0).standard_normal((40, 3))
-    columns = np.column_stack([W[:, 0], W[:, 1], W[:, 0] * 2, np.zeros(40), W[:, 2]])
-    mapping = base_mapping(columns, ("l.m", "l.mcx", "l.Ixx", "l.Iyy", "l.Izz"))
-    found = mapping.described(("l.m", "l.mcx", "l.Ixx", "l.Iyy", "l.Izz"))
-    assert found == {
-        "alone": ("l.mcx", "l.Izz"),
-        "in sums": ("l.m", "l.Ixx"),
-        "never": ("l.Iyy",),
-    }
 
 
 def test_further_terms_leave_the_base_parameters_of_the_others_as_they_are(rng):

@@ -11,13 +11,13 @@ from robotid.base.text import seconds
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.completed_logs import closed_log
 from robotid.dynamics.constraint_rows import (
     constraint_jacobian,
     force_basis,
     loop_basis,
     without_forces,
 )
+from robotid.dynamics.prepared_logs import closed_log
 from robotid.dynamics.torque import joint_torque_regressor, random_regressor
 from robotid.identification.pipeline import identify
 from robotid.robot.closure import Chains

@@ -11,8 +11,8 @@ from robotid.base.exceptions import ModelError
 from robotid.data.base_motion import ImuFrame, ImuMotion
 from robotid.data.files.read import read_log
 from robotid.data.signal_settings import BaseSource
-from robotid.dynamics.completed_logs import closed_log
 from robotid.dynamics.constraint_rows import logged_base
+from robotid.dynamics.prepared_logs import closed_log
 from robotid.robot.constraints import frame_id
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

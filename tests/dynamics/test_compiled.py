@@ -7,9 +7,8 @@ from helpers.robots import JOINT, LINK, ROBOTS, mimicking, motion
 from robotid.base.exceptions import DataError
 from robotid.dynamics import compiled, factors, rows
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.drive_columns import friction_speeds
 from robotid.dynamics.factors import compress
-from robotid.dynamics.rows import COMPILED, TrajectoryRows
+from robotid.dynamics.rows import COMPILED, TrajectoryRows, friction_speeds
 from robotid.dynamics.torque import build_problem, joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

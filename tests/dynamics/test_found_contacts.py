@@ -11,12 +11,12 @@ from robotid.cli.job import read_job
 from robotid.data.base_motion import BaseMotion, quaternions_of_angles
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.dynamics.completed_logs import (
+from robotid.dynamics.constraint_rows import constraint_jacobian
+from robotid.dynamics.prediction import predict_instants
+from robotid.dynamics.prepared_logs import (
     find_contacts,
     with_contacts,
 )
-from robotid.dynamics.constraint_rows import constraint_jacobian
-from robotid.dynamics.prediction import predict_instants
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -125,6 +125,11 @@ def test_contacts_of_a_trot_agree_with_stated_ones(recordings, monkeypatch):
         decided = np.abs(contact.touches - 0.5) > 0.48
         assert np.mean((contact.touches > 0.5)[decided] == stated[decided]) > 0.975
         assert min(on, off) > 0.2
+    # without the position of the base, the feet on the ground show how fast it moves
+    pose, twist = log.base.pose * np.repeat([0, 1], [3, 4]), log.base.twist * np.repeat([0, 1], 3)
+    blind = replace(log, contacts={}, base=BaseMotion(pose, twist))
+    _, found = find_contacts(model, blind, job.signals)
+    assert sum(contact.shares[2] for contact in found) < 0.06
 
 
 @pytest.mark.parametrize("axes", ["world", "link"])

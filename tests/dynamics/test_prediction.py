@@ -9,13 +9,13 @@ from helpers.synthetic import truth
 from robotid.base.exceptions import DataError
 from robotid.data.log import Trajectory
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.drive_columns import friction_speeds
 from robotid.dynamics.prediction import (
     body_slopes,
     body_slopes_by_position,
     predict,
     predict_instants,
 )
+from robotid.dynamics.rows import friction_speeds
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.drives import Lag, LoadFriction, Presliding, Stribeck
 from robotid.robot.examples import example_urdf

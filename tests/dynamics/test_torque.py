@@ -4,14 +4,13 @@ import pytest
 
 from robotid.base.exceptions import DataError
 from robotid.data.log import Trajectory
-from robotid.data.transmission import Transmission
+from robotid.data.signal_settings import Transmission
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.problem import Sample, concatenate, shuffled
 from robotid.dynamics.simulation.truth import another_robot
 from robotid.dynamics.torque import (
     InstantRegressor,
     build_problem,
-    carried_columns,
     joint_torque_regressor,
     mass_regressor,
     random_regressor,
@@ -192,17 +191,17 @@ def test_samples_are_shuffled_without_loss(rng):
 
 
 @pytest.mark.parametrize("name", ["ur5", "coupled"])
-def test_columns_of_what_is_carried_are_those_of_the_regressor(ur5, rng, name):
+def test_columns_of_the_bodies_are_pinocchios_and_nothing_else(ur5, rng, name):
     model = ur5
     if name == "coupled":
         model = RobotModel.from_urdf(example_urdf("tiago.urdf"), mimic="coupled")
-    n = len(model.joints)
-    q, v, a = rng.uniform(-1.0, 1.0, (3, 40, n))
+    q, v, a = rng.uniform(-1.0, 1.0, (3, 40, len(model.joints)))
     Y = joint_torque_regressor(model, q, v, a).reshape(40, model.n_rows, -1)
-    inertial = Y[:, :, : model.layout.n_inertial]
-    carried = model.support[:, : model.layout.n_inertial]
-    np.testing.assert_array_equal(carried_columns(model, q, v, a), inertial[:, carried])
-    assert not inertial[:, ~carried].any()
+    engine, G = model.pin_model, model.velocity_map
+    data = engine.createData()
+    for k, x in enumerate(model.configurations(q)):
+        whole = G.T @ pin.computeJointTorqueRegressor(engine, data, x, G @ v[k], G @ a[k])
+        np.testing.assert_allclose(Y[k, :, : whole.shape[1]], whole, atol=1e-12)
     v[3, 1] = np.nan
     with pytest.raises(DataError, match=r"v\[3\] of .* is nan, wanted a finite number"):
-        carried_columns(model, q, v, a)
+        joint_torque_regressor(model, q, v, a)

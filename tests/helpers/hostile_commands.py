@@ -402,36 +402,6 @@ def run_drive_job(table, folder, samples=200):
     obey("identify", path, "--out", out, out=out)
 
 
-# --- robotid report ------------------------------------------------------------------------------
-
-
-@cache
-def report_places():
-    """Return the places in what ``report`` reads of a result, by where they begin."""
-    content = json.loads(good_result()[1])
-    return [
-        [path for path in places(content) if path[:1] == (key,)]
-        for key in ("settings", "inputs", "outputs", "base_parameters", "structure")
-    ] + [[(key,) for key in content]]
-
-
-def reported():
-    """Edits of a result.json."""
-    new = replacements | st.sampled_from(["/dev/zero", "/dev/stdin", ".", "/", "result.json"])
-    return st.sampled_from(report_places()).flatmap(lambda found: edits(found, new))
-
-
-def run_report(given, folder):
-    path, made = folder / "result.json", folder / "made"
-    text = json.dumps(edited(json.loads(good_result()[1]), given))
-    path.write_text(text, encoding="utf-8")
-    made.mkdir()
-    obey("report", path, "--out", made / "page.html", out=made)
-    assert path.read_text(encoding="utf-8") == text, "half-written: the result was changed"
-    if (made / "page.html").exists():
-        assert "<script>alert" not in (made / "page.html").read_text(encoding="utf-8")
-
-
 #: By name: a strategy of examples, and what is done with one in an empty folder.
 COMMAND_KINDS = {
     "excite": (lambda: excitements, (), run_excite),
@@ -439,5 +409,4 @@ COMMAND_KINDS = {
     "LeRobot dataset": (datasets, (), run_dataset),
     "drives of a job": (drive_jobs, (), run_drive_job),
     "loop of a job": (loop_jobs, (), partial(run_drive_job, samples=80)),
-    "report of result.json": (reported, (), run_report),
 }

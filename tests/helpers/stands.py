@@ -1,11 +1,92 @@
-"""Motions of a robot on its feet: the trunk sways, single legs swing."""
+"""A robot on its feet, whose trunk sways and whose legs swing: its motion and its log."""
+
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
 
-from robotid.data.base_motion import quaternions_of_angles
-from robotid.dynamics.simulation.motions import FloatingMotion
+from robotid.data.base_motion import BaseMotion, in_base, quaternions_of_angles, vector_part
+from robotid.data.log import Log, Trajectory
+from robotid.dynamics.constraint_rows import constraint_jacobian, logged_base
+from robotid.dynamics.prediction import predict, remember
+from robotid.dynamics.simulation.motions import SampledMotion
 from robotid.robot.constraints import frame_id
+
+
+@dataclass(frozen=True, eq=False)
+class FloatingMotion:
+    """A motion of a robot whose base floats: splines through poses and joint positions."""
+
+    t: np.ndarray  # times, shape (N,) [s]
+    pose: np.ndarray  # pose of the base, as of ``BaseMotion``, shape (N, 7) [m, -]
+    q: np.ndarray  # joint positions, shape (N, n) [rad or m]
+    contacts: np.ndarray  # whether each touches, until the next sample, shape (N, k), bool
+
+    @cached_property
+    def _samples(self):
+        return SampledMotion(self.t, np.hstack([self.pose, self.q]))
+
+    def touching(self, t):
+        """Return which contacts touch the ground, shape (N, k), bool: t (N,) [s]."""
+        rows = np.searchsorted(self.t - self.t[0], t + 1e-9, side="right") - 1
+        flags = self.contacts[np.clip(rows, 0, len(self.t) - 1)]
+        return flags
+
+    def evaluate(self, t):
+        """Return q (N, 7 + n), v (N, 6 + n) and a (N, 6 + n), the twist with the axes of the base.
+
+        With the unit quaternion p / |p| of the spline p, w = 2 p* dp/dt / |p|^2 (vector part).
+        """
+        x, rate, change = self._samples.evaluate(t)
+        p, dp, ddp = x[:, 3:7], rate[:, 3:7], change[:, 3:7]
+        square = np.sum(p**2, axis=1, keepdims=True)
+        unit = p / np.sqrt(square)
+        w = 2.0 * vector_part(p, dp) / square
+        alpha = 2.0 * vector_part(p, ddp) / square
+        alpha -= 2.0 * np.sum(p * dp, axis=1, keepdims=True) / square * w
+        v = in_base(unit, rate[:, :3])
+        a = in_base(unit, change[:, :3]) - np.cross(w, v)
+        return (
+            np.hstack([x[:, :3], unit, x[:, 7:]]),
+            np.hstack([v, w, rate[:, 7:]]),
+            np.hstack([a, alpha, change[:, 7:]]),
+        )
+
+
+def recorded(model, pi, motion, rng, *, rate, duration, acceleration=True, noise=0.01):
+    """Return the log of a robot that follows a motion by the smallest forces of the ground.
+
+    Args:
+        model: The robot.
+        pi: Its parameters.
+        motion: Its motion.
+        rng: Source of the noise.
+        rate: Samples per second [Hz].
+        duration: Of the log [s].
+        acceleration: Whether accelerations are logged.
+        noise: Of the torques [N m].
+    """
+    t, robot = np.arange(round(duration * rate) + 1) / rate, model.with_reference(pi)
+    (q, v, a), flags = motion.evaluate(t), motion.touching(t)
+    still, segment = np.zeros_like(v), np.zeros(len(t), dtype=int)
+    rows = Trajectory(t, q, v, a, still, model.joints, None, segment)
+    (torque,) = predict(robot, [pi], remember(robot, rows))
+    J = constraint_jacobian(model, q, flags)
+    f = np.einsum("kmi,ki->km", np.linalg.pinv(J[..., :6].swapaxes(1, 2), rcond=1e-8),
+                  torque[:, :6])  # fmt: skip
+    tau = torque[:, 6:] - np.einsum("kmj,km->kj", J[..., 6:], f)
+    names, wanted = [x.frame for x in model.contacts], logged_base(model)
+    parts = [
+        f"{part} {x.frame}" for x in model.contacts for part in x.components[: x.sizes[x.kind]]
+    ]
+    return Log(
+        t, q[:, 7:], tau + noise * rng.standard_normal(tau.shape), model.joints, v[:, 6:],
+        a[:, 6:] if acceleration else None,
+        base=BaseMotion(q[:, :7], v[:, :6], a[:, :6] if acceleration else None),
+        contacts={link: flags[:, names.index(link)] for link in wanted.contacts},
+        wrenches={name: f[:, parts.index(name)] for name in wanted.wrenches},
+    )  # fmt: skip
 
 
 def stand(model, middle, height, rng, *, parts=4, length=3.0, rate=100.0, size=1.0):

@@ -2,17 +2,11 @@
 
 import numpy as np
 import pytest
-from helpers.stands import stand
+from helpers.stands import recorded, stand
 
 from robotid.data.signal_settings import SignalSettings
-from robotid.dynamics.simulation.simulation_settings import (
-    Controller,
-    Noise,
-    Payload,
-    Sensors,
-    Simulation,
-)
-from robotid.dynamics.simulation.simulator import simulate
+from robotid.dynamics.simulation.simulation_settings import Payload
+from robotid.dynamics.simulation.simulator import carried
 from robotid.estimation.estimators import two_runs
 from robotid.identification.payload_fit import identify_payload
 from robotid.robot.constraints import Contact
@@ -35,19 +29,12 @@ def robot():
 @pytest.fixture(scope="module")
 def runs(robot):
     """Return the log with the payload, and that without it."""
-    sensors = Sensors(noise=Noise(torque=0.01), acceleration=True)
     found = []
     for seed, payload in enumerate((PACK, Payload())):
         rng = np.random.default_rng(seed)
         motion = stand(robot, np.tile([0.0, 0.8, -1.6], 4), 0.25, rng, length=1.0)
-        settings = Simulation(
-            controller=Controller(kind="perfect"), sensors=sensors, payload=payload
-        )
-        log = simulate(
-            robot, robot.standard_parameters(), motion, rate=80.0, duration=3.0, rng=rng,
-            settings=settings,
-        )  # fmt: skip
-        found.append(log)
+        pi = carried(robot, robot.standard_parameters(), payload)
+        found.append(recorded(robot, pi, motion, rng, rate=80.0, duration=3.0))
     return found
 
 

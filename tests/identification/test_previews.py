@@ -24,9 +24,9 @@ from robotid.design.previews import (
 )
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import Factors, compress
+from robotid.dynamics.prepared_logs import base_problem
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.torque import joint_torque_regressor, trajectory_regressor
-from robotid.dynamics.used_rows import base_problem
 from robotid.estimation.estimators.estimator import scatter
 from robotid.estimation.fitting.survey import hold_log
 from robotid.output.files.entries import build_preview

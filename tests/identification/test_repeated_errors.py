@@ -12,7 +12,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.constraint_rows import constraint_jacobian, touching
 from robotid.dynamics.prediction import predict
-from robotid.dynamics.used_rows import base_problem
+from robotid.dynamics.prepared_logs import base_problem
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.repeated_errors import (

@@ -3,8 +3,14 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.synthetic import truth
 
 from robotid.base.exceptions import DataError, SettingsError
+from robotid.data.signal_settings import SignalSettings
+from robotid.dynamics.torque import joint_torque_regressor
+from robotid.robot.examples import example_urdf
+from robotid.robot.mass_matrix import check_mass_matrix, joint_mass_matrices
+from robotid.robot.model import RobotModel
 from robotid.robot.parameters import (
     INERTIAL_TERMS,
     Coupling,
@@ -115,3 +121,93 @@ def test_a_slider_counts_by_its_stroke_and_a_coupling_by_the_mean_of_its_joints(
     wanted = [1.0, *[0.4] * 3, *[0.16] * 6]
     wanted += [0.16 if n in ("a.armature", "motor.armature") else 1.0 for n in layout.drive_names]
     np.testing.assert_allclose(layout.scales(length), wanted)  # an armature of a slider is a mass
+
+
+EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+NOISE = np.array([1.0, 0.3, 0.2])  # [N m]
+
+
+@pytest.fixture(scope="module")
+def forearm(ur5):
+    """The elbow of a UR5 and two joints of its wrist."""
+    return RobotModel.from_urdf(ur5.tree.path, joints=ur5.joints[2:5])
+
+
+def test_it_is_what_accelerations_cost_armatures_and_couplings_included(rng):
+    # tau(q, 0, a) - tau(q, 0, 0) = M a
+    coupling = Coupling("motor", (("wrist_2_joint", 1.0), ("wrist_3_joint", -2.0)))
+    model = RobotModel.from_urdf(
+        example_urdf("ur5_robot.urdf"), terms=("armature", "offset"), couplings=(coupling,)
+    )
+    pi, q = truth(model), rng.uniform(-2, 2, (3, 6))
+    pi[-1] = 0.3
+    M = joint_mass_matrices(model, pi, q)
+    still, a = np.zeros_like(q), rng.standard_normal(q.shape)
+    torque = [
+        (joint_torque_regressor(model, q, still, x) @ pi).reshape(q.shape) for x in (a, still)
+    ]
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", M, a), torque[0] - torque[1], atol=1e-10)
+
+
+def test_poses_stay_within_the_limits_and_the_share_is_counted(ur5):
+    pi = ur5.standard_parameters()
+    good = check_mass_matrix(ur5, pi, poses=300)
+    assert good.is_positive
+    assert good.positive_share == 1.0
+    oracle = []
+    rng = np.random.default_rng(0)
+    low, high = (np.array([getattr(j, side) for j in ur5.limits]) for side in ("lower", "upper"))
+    data = ur5.pin_model.createData()
+    for q in rng.uniform(low, high, (300, 6)):
+        M = pin.crba(ur5.pin_model, data, q)
+        oracle.append(np.linalg.eigvalsh(np.triu(M) + np.triu(M, 1).T)[0])
+    assert good.smallest_eigenvalue == pytest.approx(min(oracle))
+    pi[1:4] += 0.0
+    pi[10] = -5.0  # the upper arm lifts itself
+    pi[14:20] = 0.0
+    bad = check_mass_matrix(ur5, pi, poses=300)
+    assert bad.smallest_eigenvalue < 0
+    assert 0.0 <= bad.positive_share < 1.0
+    assert not bad.is_positive
+
+
+@pytest.mark.parametrize("upper_arm", [None, 1.0, -5.0])
+def test_the_least_and_the_share_are_those_of_every_block_of_poses(ur5, upper_arm):
+    pi = ur5.standard_parameters()
+    if upper_arm is not None:
+        pi[10], pi[14:20] = upper_arm, 0.0  # its mass, without inertia
+    found = check_mass_matrix(ur5, pi, poses=1500)
+    low, high = (np.array([getattr(j, side) for j in ur5.limits]) for side in ("lower", "upper"))
+    q = np.random.default_rng(0).uniform(low, high, (1500, 6))
+    least = np.linalg.eigvalsh(joint_mass_matrices(ur5, pi, q))[:, 0]
+    assert found.smallest_eigenvalue == pytest.approx(least.min(), rel=1e-9)
+    assert found.positive_share == np.mean(least > 0)
+    if upper_arm is None:
+        assert least.argmin() > 400, "it is not in the first blocks"
+
+
+def test_a_floating_base_has_one_too():
+    model = RobotModel.from_urdf(example_urdf("solo12.urdf"), free_flyer=True)
+    assert check_mass_matrix(model, model.standard_parameters(), poses=20).is_positive
+
+
+def test_a_slider_without_limits_stays_within_a_metre_and_a_joint_goes_half_a_turn(tmp_path):
+    """A bar turns with m x^2 - I at the way x of its slider: possible where x^2 > I / m."""
+    moments = 'ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"'
+    inertial = f'<inertial><mass value="1"/><inertia {moments}/></inertial>'
+    (tmp_path / "bar.urdf").write_text(f"""<robot name="bar"><link name="base"/>
+        <link name="arm">{inertial}</link><link name="hand">{inertial}</link>
+        <joint name="turn" type="continuous"><parent link="base"/><child link="arm"/>
+            <axis xyz="0 0 1"/></joint>
+        <joint name="slide" type="prismatic"><parent link="arm"/><child link="hand"/>
+            <axis xyz="1 0 0"/></joint></robot>""")
+    model = RobotModel.from_urdf(tmp_path / "bar.urdf", terms=())
+    pi = np.zeros(20)
+    pi[9], pi[10] = -0.5, 2.0  # izz of the arm, mass of the hand
+    check = check_mass_matrix(model, pi, poses=450, seed=3)
+    draws = np.random.default_rng(3).uniform([-np.pi, -1.0], [np.pi, 1.0], (450, 2))
+    turning = 2.0 * draws[:, 1] ** 2 - 0.5
+    assert check.poses == 450
+    assert check.positive_share == np.mean(turning > 0)
+    assert check.smallest_eigenvalue == pytest.approx(turning.min(), rel=1e-9)
+    assert not check.is_positive

@@ -10,17 +10,16 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from robotid.base.exceptions import DataError, MissingDependencyError
+from robotid.base.exceptions import DataError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.data.base_motion import ACCELERATION, POSE, TWIST, in_base
 from robotid.data.files.columns import is_quantity
-from robotid.data.files.table import Format, Table, choose, parsing
+from robotid.data.files.table import Format, Table, choose, load_package, parsing
 from robotid.data.log import suggestion
 from robotid.data.signal_settings import LogSource
 
@@ -36,7 +35,6 @@ _SIMULATED = {
     "applied_torque": ("tau", 0),
 }  # fmt: skip
 _ROOTS = ("root_link_state_w", "root_state_w")
-_ROOT = 13  # values of a root state: position, quaternion, linear and angular velocity
 _OF_MASS = (
     "root_state_w has the velocity of the centre of mass, which is not used; export "
     "root_link_state_w to use it"
@@ -90,17 +88,12 @@ def _open_npz(path: Path, source: LogSource) -> Table:
 
 
 def _write_npz(table: Mapping[str, Array], path: Path) -> None:
-    columns: dict[str, Any] = dict(table)
     with path.open("wb") as file:
-        np.savez_compressed(file, **columns)
-
-
-def _open_hdf5(path: Path, source: LogSource) -> Table:
-    return _table_of_arrays(path, _datasets(path, is_matlab=False), source)
+        np.savez_compressed(file, **dict[str, Any](table))
 
 
 def _write_hdf5(table: Mapping[str, Array], path: Path) -> None:
-    h5py = _h5py("writing HDF5")
+    (h5py,) = load_package("writing HDF5", "hdf5", "h5py")
     # first in memory: HDF5 ends the process if the disk is full
     with h5py.File(path, "w", driver="core", backing_store=False) as file:
         for name, values in table.items():
@@ -132,7 +125,11 @@ def _write_mat(table: Mapping[str, Array], path: Path) -> None:
 
 
 NPZ = Format((".npz",), _open_npz, _write_npz, written=(".npz",), topics="group")
-HDF5 = Format((".h5", ".hdf5"), _open_hdf5, _write_hdf5, written=(".h5", ".hdf5"), topics="group")
+HDF5 = Format(
+    (".h5", ".hdf5"),
+    lambda path, source: _table_of_arrays(path, _datasets(path, is_matlab=False), source),
+    _write_hdf5, written=(".h5", ".hdf5"), topics="group",
+)  # fmt: skip
 MAT = Format((".mat",), _open_mat, _write_mat, written=(".mat",), topics="group")
 
 
@@ -150,19 +147,14 @@ def _table_of_arrays(path: Path, entries: Mapping[str, _Entry], source: LogSourc
     for name, entry in inside.items():
         if entry.is_number:
             _require_plausible_size(path, name, entry.shape)
-    simulated: dict[str, _Entry] = {}
-    if not any(name == "q" or name.startswith("q_") for name in inside):
-        simulated = {
-            name: entry
-            for name, entry in inside.items()
-            if name in (*_SIMULATED, *_ROOTS) and entry.width > 1
-        }
+    known = () if any(x == "q" or x.startswith("q_") for x in inside) else (*_SIMULATED, *_ROOTS)
+    simulated = {name: x for name, x in inside.items() if name in known and x.width > 1}
     columns: dict[str, _Column] = {}
     for name, entry in inside.items():
         if name not in simulated:
             columns |= _columns_of(where, name, entry, joints)
-    for name, entry in simulated.items():
-        columns |= _joint_columns(where, name, entry, joints) if name in _SIMULATED else {}
+    for name in filter(_SIMULATED.__contains__, simulated):
+        columns |= _joint_columns(where, name, simulated[name], joints)
     columns |= _base_columns(where, simulated, len(joints))
     is_of_mass = "root_state_w" in simulated and "root_link_state_w" not in simulated
     notes = (_OF_MASS,) if is_of_mass and simulated.get("qpos") is None else ()
@@ -252,8 +244,9 @@ def _base_columns(where: str, arrays: Mapping[str, _Entry], joints: int) -> dict
         names = names if "qvel" in names else ["qpos"]
         kinds = (POSE, TWIST, ACCELERATION)[: len(names)]
     elif root:
-        if arrays[root].width != _ROOT:
-            raise DataError(f"{where}: {root} has {arrays[root].width} columns, wanted {_ROOT}")
+        wanted = len((*POSE, *TWIST))
+        if arrays[root].width != wanted:
+            raise DataError(f"{where}: {root} has {arrays[root].width} columns, wanted {wanted}")
         names, kinds = [root], (POSE, TWIST) if root == "root_link_state_w" else (POSE,)
     else:
         return {}
@@ -303,18 +296,9 @@ def _entry(array: Array) -> _Entry:
     return _Entry(array.shape, array.dtype.kind in "iuf", lambda: array)
 
 
-def _h5py(purpose: str) -> ModuleType:
-    try:
-        import h5py
-    except ImportError as error:
-        raise MissingDependencyError(purpose, "h5py", "hdf5") from error
-    package: ModuleType = h5py
-    return package
-
-
 @contextmanager
 def _hdf5_file(path: Path) -> Iterator[Any]:
-    h5py = _h5py("reading HDF5 and MATLAB v7.3")
+    (h5py,) = load_package("reading HDF5 and MATLAB v7.3", "hdf5", "h5py")
     with parsing(path, "HDF5"), h5py.File(path, "r") as file:
         yield file
 

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from robotid.base.exceptions import DataError, MissingDependencyError
+from robotid.base.exceptions import DataError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
-from robotid.data.base_motion import IMU, POSE, TWIST
-from robotid.data.files.table import Format, Table, choose
+from robotid.data.base_motion import IMU, POSE, TWIST, continuous_signs
+from robotid.data.files.table import Format, Table, choose, load_package
 from robotid.data.log import repeated, suggestion
 from robotid.data.signal_settings import LogSource
 
@@ -65,10 +65,7 @@ class _Bag:
         return {topic: kind for topic, kind in self.types.items() if topic in filled}
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Yield stamp [ns] and message; errors of the library become a DataError.
-
-        The stamp is that of the header, if there is one.
-        """
+        """Yield stamp [ns], of the header if any, and message; errors become a DataError."""
         chosen, is_stamped = [c for c in self.reader.connections if c.topic == topic], False
         count = 0
         try:
@@ -99,13 +96,9 @@ def _open(path: Path, source: LogSource) -> Table:
     of the required columns, as those of another publisher, are ignored; an inconsistent message,
     or one with only some of the required columns, is a ``DataError``.
 
-    A JointTrajectoryControllerState contains commands, too: its output to the drives, else its
-    reference (formerly "desired"), as ``qref_<joint>`` and ``dqref_<joint>``, and the effort of
-    the reference as ``tauref_<joint>``. For joint states, the commands are in a second topic; a
-    zero-order hold brings them to the time stamps of the states.
-
-    A LowState of Unitree contains its motors, by number: ``position_0``. Columns of sensors are of
-    further topics, as of ``_with_sensors``.
+    A controller's state has commands, too (``_controlled``). For joint states, these are in a
+    second topic; a zero-order hold brings them to the time stamps of the states. A LowState of
+    Unitree contains its motors, by number: ``position_0``.
     """
     with _opened(path, source) as bag:
         sensors = _sensors_of(bag)
@@ -133,13 +126,8 @@ BAG = Format((".mcap", ".db3", ".bag"), _open, topics="topic")
 
 @contextmanager
 def _opened(path: Path, source: LogSource) -> Iterator[_Bag]:
-    try:
-        from rosbags.rosbag1 import Reader as Reader1
-        from rosbags.rosbag2 import Reader as Reader2
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        purpose = "reading ROS bags and MCAP files"
-        raise MissingDependencyError(purpose, "rosbags", "bag") from error
+    modules = ("rosbags.rosbag1", "rosbags.rosbag2", "rosbags.typesys")
+    ros1, ros2, typesys = load_package("reading ROS bags and MCAP files", "bag", *modules)
     if path.is_dir() and not (path / "metadata.yaml").is_file():
         raise DataError(
             f"{path.name} is a folder without metadata.yaml, so it is not a ROS 2 bag, and without "
@@ -147,10 +135,11 @@ def _opened(path: Path, source: LogSource) -> Iterator[_Bag]:
             "restore it with 'ros2 bag reindex'"
         )
     is_ros1 = path.suffix.lower() == ".bag" and not path.is_dir()
-    types = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.LATEST)
+    stores = typesys.Stores
+    types = typesys.get_typestore(stores.ROS1_NOETIC if is_ros1 else stores.LATEST)
     deserialize = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
     try:
-        reader: Any = Reader1(path) if is_ros1 else Reader2(path)
+        reader = (ros1 if is_ros1 else ros2).Reader(path)
         reader.open()
     except Exception as error:  # a parser of foreign bytes fails in many ways
         raise _broken(path, error) from error
@@ -215,10 +204,7 @@ def _is_low_state(kind: str) -> bool:
 
 
 def _choose_topic(bag: _Bag) -> str:
-    """Return the topic to read: the stated one, or the only one of joint states or a controller.
-
-    The topic of the commands must be another one, of joint states.
-    """
+    """Return the stated topic, or the only one of joint states or of a controller."""
     where, source, types, filled = bag.path.name, bag.source, bag.types, bag.filled
     listing = f"topics: {dict(sorted(types.items()))}"
     low = [kind for kind in types.values() if _is_low_state(kind)]
@@ -297,6 +283,7 @@ def _content(
 def _controlled(message: Any) -> dict[str, Any]:  # noqa: ANN401
     """Return the fields of a controller's state; a field with NaN only is empty.
 
+    Commands are its output to the drives, else its reference; the effort is that of the reference.
     Up to control_msgs 4 its points were called desired and actual.
     """
 
@@ -440,10 +427,7 @@ def _sensors_of(bag: _Bag) -> list[_Sensor]:
 def _with_sensors(
     states: Table, path: Path, sensors: Sequence[_Sensor], source: LogSource
 ) -> Table:
-    """Return a table with the columns of sensors, interpolated linearly at its time stamps.
-
-    Rows before the first or after the last message of a topic that is read are left out.
-    """
+    """Return a table with columns of sensors, interpolated; rows outside them are left out."""
     by_column: dict[str, list[_Sensor]] = {}
     for sensor in sensors:
         for name in sensor.columns:
@@ -453,7 +437,13 @@ def _with_sensors(
         sensed = [name for name in wanted if name in by_column]
         used = {by_column[name][0].topic: by_column[name][0] for name in sensed}
         for name in sensed:
-            _require_one(path.name, name, by_column[name])
+            topics = [sensor.topic for sensor in by_column[name]]
+            if len(topics) > 1:
+                raise DataError(
+                    f"{path.name} has {len(topics)} topics with {name}: {listed(topics)}. State "
+                    f'all topics of sensors to read: sensors = ["{topics[0]}"] (job file table '
+                    "[log], Python source=LogSource(sensors=...))"
+                )
         others = [name for name in wanted if name not in by_column and name != "time"]
         rows = states.read(["time", *others])
         loaded = {topic: sensor.load(path, source) for topic, sensor in used.items()}
@@ -473,20 +463,9 @@ def _with_sensors(
             rows |= _interpolated(t, columns, rows["time"])
         return {name: rows[name] for name in wanted}
 
-    topics = {name: f"topic {own[0].topic!r}" for name, own in by_column.items()}
+    sources = {name: f"topic {having[0].topic!r}" for name, having in by_column.items()}
     axes = {"wrench": "link"}
-    return replace(states, names=[*states.names, *topics], read=read, sensors=topics, axes=axes)
-
-
-def _require_one(where: str, name: str, sensors: Sequence[_Sensor]) -> None:
-    """Reject a column that several topics have."""
-    topics = [sensor.topic for sensor in sensors]
-    if len(topics) > 1:
-        raise DataError(
-            f"{where} has {len(topics)} topics with {name}: {listed(topics)}. State all topics of "
-            f'sensors to read: sensors = ["{topics[0]}"] (job file table [log], Python '
-            "source=LogSource(sensors=...))"
-        )
+    return replace(states, names=[*states.names, *sources], read=read, sensors=sources, axes=axes)
 
 
 def _interpolated(t: Array, columns: Mapping[str, Array], at: Array) -> dict[str, Array]:
@@ -496,9 +475,7 @@ def _interpolated(t: Array, columns: Mapping[str, Array], at: Array) -> dict[str
     quaternions = [[f"{start}{end}" for end in ("qx", "qy", "qz", "qw")] for start in starts]
     for names in quaternions:
         q = np.column_stack([columns[name] for name in names])
-        is_opposite = np.sum(q[1:] * q[:-1], axis=1) < 0
-        q *= np.where(np.append(0, np.cumsum(is_opposite)) % 2, -1.0, 1.0)[:, None]
-        columns |= dict(zip(names, q.T, strict=True))
+        columns |= dict(zip(names, (continuous_signs(q) * q).T, strict=True))
     values = {name: np.interp(at, t, x) for name, x in columns.items()}
     for names in quaternions:
         size = np.linalg.norm(np.column_stack([values[name] for name in names]), axis=1)

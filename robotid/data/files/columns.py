@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from itertools import chain
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -16,8 +17,7 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed, quoted, toml_key
 from robotid.base.settings import is_number
 from robotid.data.log import repeated, suggestion
-from robotid.data.signal_settings import LogSource
-from robotid.data.transmission import Transmission
+from robotid.data.signal_settings import LogSource, Transmission
 from robotid.robot.tree import Joint
 
 _QUANTITIES = {
@@ -69,7 +69,7 @@ def read_names(
 ) -> Reading:
     """Return the columns of each joint."""
     joints = {label: place for place, label in places.items()}
-    read = [(name, found) for name in names if (found := quantity_of(name, effort, joints))]
+    read = [(name, quantity) for name in names if (quantity := quantity_of(name, effort, joints))]
     if numbered := _numbered(read, joints, orders):
         return numbered
     columns: dict[tuple[str, str], list[str]] = {}
@@ -142,10 +142,10 @@ def quantity_of(
 
 def named_by_row(row: Mapping[str, object]) -> dict[str, str]:
     """New names of columns whose joint is a text in a row: field.position0 by field.name0."""
-    found = {match: cell for x, cell in row.items() if (match := _NAME.fullmatch(x))}
+    joints = {match: cell for x, cell in row.items() if (match := _NAME.fullmatch(x))}
     return {
         x: f"{x.removesuffix(match[2])}_{str(joint).strip()}"
-        for match, joint in found.items()
+        for match, joint in joints.items()
         for x in row
         if x.startswith(match[1]) and x.endswith(match[2]) and is_quantity(x.removesuffix(match[2]))
     }
@@ -282,18 +282,24 @@ class Finder:
         """Return the columns to read: time, q, required quantities, complete optional ones."""
         self._check_arguments()
         self.notes.extend(self.reading.notes)
-        found = {"time": [self._find("time", self._clocks()) or self._no_time()]}
-        optional, wanted = ["dq", "ddq"], self._wanted()
+        if (clock := self._find("time", self._clocks())) is None:
+            raise DataError(
+                f"{self.where} has no column 'time'; columns found: {listed(self.names)}. Rename "
+                'it, or state in the job file: columns = { time = "NAME" }, or without time stamps '
+                "the rate of the rows [Hz]: log = { rate = 100 }",
+                code="missing_column",
+            )
+        chosen, optional, wanted = {"time": [clock]}, ["dq", "ddq"], self._wanted()
         self._require(wanted)
-        found["q"] = list(filter(None, map(self._find_of, *self._places("q"))))
+        chosen["q"] = list(filter(None, map(self._find_of, *self._places("q"))))
         if "commands" in wanted:
-            found["qref"] = list(filter(None, map(self._find_of, *self._places("qref"))))
+            chosen["qref"] = list(filter(None, map(self._find_of, *self._places("qref"))))
             optional += ["dqref", "tauref"]
         if "torque" in wanted or ("commands" in wanted and self._has_all_torques()):
             places = zip(self.joints, *self._places("tau"), strict=True)
-            found["tau"] = ["" if joint in self.passive else self._find_torque(kind, name)
+            chosen["tau"] = ["" if joint in self.passive else self._find_torque(kind, name)
                             for joint, kind, name in places]  # fmt: skip
-        found |= {kind: names for kind in optional if (names := self._find_optional(kind))}
+        chosen |= {kind: names for kind in optional if (names := self._find_optional(kind))}
         sizes = [name for name in self.names if name.startswith(_SIZES) and name not in self.seen]
         if sizes:
             self.notes.append(
@@ -303,11 +309,11 @@ class Finder:
         extra = [name for name in self.names if name not in {*self.seen, *sizes}]
         if extra:
             self.notes.append(f"columns ignored: {listed(extra)}")
-        if twice := repeated([name for names in found.values() for name in names if name]):
+        if twice := repeated([name for names in chosen.values() for name in names if name]):
             raise SettingsError(
                 f"{self.where}: {listed(twice)} are read twice; correct columns in the job file"
             )
-        return found
+        return chosen
 
     def factors(self, torques: Sequence[str]) -> tuple[float, ...]:
         """Return the factor that converts each of n columns to a torque: a current's gain, or 1."""
@@ -334,11 +340,8 @@ class Finder:
     @property
     def motors(self) -> dict[str, str]:
         """The motor that corresponds to each joint that has one, by joint."""
-        return {
-            joint: motor
-            for gear in self.gears
-            for joint, motor in zip(gear.joints, gear.names, strict=True)
-        }
+        pairs = (zip(gear.joints, gear.names, strict=True) for gear in self.gears)
+        return dict(chain.from_iterable(pairs))
 
     def of_motors(self, kind: str) -> tuple[bool, ...]:
         """Return for which joints a quantity is read from the corresponding motor."""
@@ -361,11 +364,7 @@ class Finder:
 
     def has_torque(self, joint: str) -> bool:
         """Return whether the file has a torque or a current of a joint."""
-        return self._has("tau", joint) or self._has("current", joint)
-
-    def has_position(self, joint: str) -> bool:
-        """Return whether the file has the position of a joint."""
-        return self._has("q", joint)
+        return self.has("tau", joint) or self.has("current", joint)
 
     def _places(self, kind: str) -> tuple[list[str], list[str]]:
         """Return the kinds and names of the columns of each joint: its own, or its motor's."""
@@ -463,7 +462,7 @@ class Finder:
         if self.needs != "any":
             return {self.needs}
         has_torque = any(map(self.has_torque, self.joints))
-        has_command = [self._has("qref", joint) for joint in self.joints]
+        has_command = [self.has("qref", joint) for joint in self.joints]
         is_commanded = all(has_command) or (any(has_command) and not has_torque)
         wanted = {"commands"} if is_commanded else set[str]()
         return wanted | ({"torque"} if has_torque or not wanted else set())
@@ -473,8 +472,8 @@ class Finder:
         without = [
             joint
             for joint, kind, name in zip(self.joints, *self._places("tau"), strict=True)
-            if joint not in self.passive and not self._has(kind, name)
-            and not (name in self.gains and self._has(f"current{kind[3:]}", name))
+            if joint not in self.passive and not self.has(kind, name)
+            and not (name in self.gains and self.has(f"current{kind[3:]}", name))
         ]  # fmt: skip
         if without and any(map(self.has_torque, self.joints)):
             self.notes.append(
@@ -486,8 +485,8 @@ class Finder:
         """Return the error of a current without a gain, with the missing columns of all joints."""
         without, absent = [joint], list[str]()
         if joint in self.joints:
-            logged = [other for other in self.joints if self._has("current", other)]
-            without = [x for x in logged if not self._has("tau", x) and x not in self.gains]
+            logged = [other for other in self.joints if self.has("current", other)]
+            without = [x for x in logged if not self.has("tau", x) and x not in self.gains]
             absent = [x for x in self.joints if not self.has_torque(x)]
         has = f"joint {joint!r} has the current {current!r}"
         if len(without) > 1:
@@ -523,25 +522,12 @@ class Finder:
         plain = [name for name in clocks if name in ("time", "t")]
         return plain or [name for name in clocks if "header" in name.lower()] or clocks
 
-    def _no_time(self) -> str:
-        """Reject a log without a time column."""
-        raise DataError(
-            f"{self.where} has no column 'time'; columns found: {listed(self.names)}. Rename it, "
-            'or state in the job file: columns = { time = "NAME" }, or without time stamps the '
-            "rate of the rows [Hz]: log = { rate = 100 }",
-            code="missing_column",
-        )
-
-    def _has(self, kind: str, joint: str) -> bool:
+    def has(self, kind: str, joint: str) -> bool:
         """Return whether the file has a quantity of a joint or of its motor."""
-        return (
-            f"{kind}_{joint}" in self.columns
-            or (kind, joint) in self.reading.columns
-            or (
-                (kind in _OF_JOINTS and joint in self.motors)
-                and self._has(f"{kind}m", self.motors[joint])
-            )
-        )
+        if f"{kind}_{joint}" in self.columns or (kind, joint) in self.reading.columns:
+            return True
+        is_driven = kind in _OF_JOINTS and joint in self.motors
+        return is_driven and self.has(f"{kind}m", self.motors[joint])
 
     # --- a log that lacks required columns --------------------------------------------------------
 
@@ -558,36 +544,36 @@ class Finder:
                 (kind, name)
                 for joint, kind, name in zip(self.joints, *self._places("tau"), strict=True)
                 if joint not in self.passive
-                and not (self._has(kind, name) or self._has(f"current{kind[3:]}", name))
+                and not (self.has(kind, name) or self.has(f"current{kind[3:]}", name))
             ]
-        has_no_gain = any(self._has("current", x) and x not in self.gains for x in self.joints)
+        has_no_gain = any(self.has("current", x) and x not in self.gains for x in self.joints)
         if not absent or (has_no_gain and all(kind == "tau" for kind, _ in absent)):
             return  # the error of a missing gain names these joints, too
         clock = self._find("time", self._clocks())
         read = {*self.joints, *self.motors.values()}
         columns = self.reading.columns.items()
-        found = {"time": clock} if clock else {}
-        found |= {f"{kind}_{x}": own for (kind, x), (own, *_) in columns if x in read}
-        found |= self.columns
+        recognised = {"time": clock} if clock else {}
+        recognised |= {f"{kind}_{x}": own for (kind, x), (own, *_) in columns if x in read}
+        recognised |= self.columns
         of_others = {name for (_, x), own in columns if x not in read for name in own}
         names = [name for name in self.names if name not in of_others]
-        raise self._missing(names, absent, found)
+        raise self._missing(names, absent, recognised)
 
     def _missing(
-        self, names: Sequence[str], absent: Sequence[tuple[str, str]], found: Mapping[str, str]
+        self, names: Sequence[str], absent: Sequence[tuple[str, str]], recognised: Mapping[str, str]
     ) -> DataError:
         """Return the error of missing columns: what was found, and a table to complete.
 
-        ``absent`` has quantity and joint, or motor; ``found`` the columns by standard name.
+        ``absent`` has quantity and joint, or motor; ``recognised`` the columns by standard name.
         """
         sought = [f"{kind}_{self._named(place)}" for kind, place in absent]
         sizes = [name for name in names if name.startswith(_SIZES)]
-        left = [x for x in names if x not in {*found.values(), *sizes}]
+        left = [x for x in names if x not in {*recognised.values(), *sizes}]
         nouns = dict.fromkeys(NOUNS[kind.removesuffix("m")] for kind, _ in absent)
         ends = tuple(kind.replace("tau", t) + "_" for kind, _ in absent for t in ("tau", "current"))
-        of_kind = [column for key, column in found.items() if key.startswith(ends)]
+        of_kind = [column for key, column in recognised.items() if key.startswith(ends)]
         references = tuple(f"{kind.removesuffix('ref')}ref_" for kind, _ in absent)
-        read = [x for key, x in found.items() if key.startswith(references)]
+        read = [x for key, x in recognised.items() if key.startswith(references)]
         commanded = [x for x in names if is_commanded(x) and x in {*left, *read}]
         others = [name for name in left if name not in commanded]
         text = (
@@ -603,7 +589,7 @@ class Finder:
         by_order, remedy = self._by_order(left, absent), self._remedy(absent)
         if not (by_order or others):
             return DataError(f"{text} {remedy}", code="missing_column")
-        lines = [f"{toml_key(key)} = {quoted(x)}" for key, x in found.items()]
+        lines = [f"{toml_key(key)} = {quoted(x)}" for key, x in recognised.items()]
         lines += [f"{toml_key(key)} = {quoted(x)}  # by order" for key, x in by_order.items()]
         lines += [f'# {toml_key(key)} = "NAME"' for key in map("_".join, absent)
                   if key not in by_order]  # fmt: skip
@@ -640,8 +626,8 @@ class Finder:
             )
         kind, joints = absent[0][0], [joint for _, joint in absent]
         if kind == "tau" and not any(map(self.has_torque, self.joints)):
-            return without_torque(all(self._has("qref", other) for other in self.joints))
-        if kind == "qref" and not any(self._has("qref", other) for other in self.joints):
+            return without_torque(all(self.has("qref", other) for other in self.joints))
+        if kind == "qref" and not any(self.has("qref", other) for other in self.joints):
             return "; ".join(["Record the commands of the controller", *self.notes])
         at_rest = [joint for joint in self.joints if joint in joints]
         if len(at_rest) == len(self.joints):

@@ -150,10 +150,7 @@ def _utf8(path: Path) -> Iterator[None]:
 def _header(
     path: Path, source: LogSource
 ) -> tuple[list[str], str | None, int, Mapping[str, object]]:
-    """Return the names in the first line, the separator, the lines before the rows, and a row.
-
-    Without a header, the names are the numbers of the columns.
-    """
+    """Return names (numbers without a header), separator, lines before the rows, and a row."""
     with _utf8(path), path.open(encoding="utf-8-sig") as file:  # with or without a byte order mark
         line, second = file.readline(), file.readline()
     if not line.strip():

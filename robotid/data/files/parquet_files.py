@@ -17,12 +17,20 @@ from typing import Any
 
 import numpy as np
 
-from robotid.base.exceptions import DataError, MissingDependencyError
+from robotid.base.exceptions import DataError
 from robotid.base.files import DATASET, missing_file, read_json
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.data.files.columns import named_by_row
-from robotid.data.files.table import Format, Place, RowReader, Table, choose, parsing
+from robotid.data.files.table import (
+    Format,
+    Place,
+    RowReader,
+    Table,
+    choose,
+    load_package,
+    parsing,
+)
 from robotid.data.log import repeated, suggestion
 from robotid.data.signal_settings import LogSource
 
@@ -53,12 +61,7 @@ PARQUET = Format((".parquet",), _open, _write, written=(".parquet",))
 
 def load_pyarrow(purpose: str) -> ModuleType:
     """Return pyarrow, with pyarrow.parquet imported."""
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError as error:
-        raise MissingDependencyError(purpose, "pyarrow", "parquet") from error
-    package: ModuleType = pyarrow
+    package: ModuleType = load_package(purpose, "parquet", "pyarrow", "pyarrow.parquet")[0]
     return package
 
 
@@ -210,10 +213,7 @@ _Place = tuple[str, int]  # a feature, and the number of a value in its vectors
 
 
 def _open_episode(path: Path, source: LogSource) -> Table:
-    """Return the table of an episode: the topic, as ``episode_3``, or the only one.
-
-    LeRobot computes the time stamps of an episode from the numbers of the frames.
-    """
+    """Return the table of an episode: that of the topic, as ``episode_3``, or the only one."""
     pa = load_pyarrow("reading LeRobot datasets")
     columns = _motor_columns(path, _features(path))
     parts: dict[int, list[Path]] = {}  # files with rows of an episode, by its number
@@ -291,8 +291,7 @@ def _episode(path: Path, numbers: Sequence[int], wanted: str | None) -> int:
     if not names:
         raise DataError(f"{path.name} has no episode: its files data/**/*.parquet have no rows")
     if wanted is None:
-        chosen = choose(path.name, names, "episodes", "each episode is a separate log")
-        return numbers[names.index(chosen)]
+        wanted = choose(path.name, names, "episodes", "each episode is a separate log")
     digits = re.fullmatch(r"(?:episode_)?0*([0-9]+)", wanted)
     chosen = f"episode_{digits[1]}" if digits else wanted
     if chosen not in names:

@@ -16,14 +16,25 @@ from typing import Any, get_args
 import numpy as np
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.base.files import check_file, check_path
+from robotid.base.files import (
+    DATASET,
+    check_file,
+    check_path,
+    dataset_of,
+    missing_file,
+    written_whole,
+)
 from robotid.base.findings import listed
 from robotid.base.settings import require_each, require_kind
 from robotid.base.typing import Array
 from robotid.data.base_motion import BaseColumns, base_columns, base_of, contacts_of, table_of_base
+from robotid.data.files.arrays import HDF5, MAT, NPZ
+from robotid.data.files.bags import BAG
 from robotid.data.files.columns import NOUNS, TORQUES, Finder, Needs, without_torque
-from robotid.data.files.formats import open_table, write_columns
+from robotid.data.files.csv_files import CSV
+from robotid.data.files.parquet_files import LEROBOT, PARQUET
 from robotid.data.files.table import (
+    Format,
     Frame,
     Table,
     is_frame,
@@ -34,15 +45,24 @@ from robotid.data.files.table import (
     with_time,
 )
 from robotid.data.log import COLUMNS, Log, require_finite, require_increasing
-from robotid.data.signal_settings import PER_SECOND, LogSource, LogUnits
-from robotid.data.transmission import Transmission, check_transmissions
+from robotid.data.signal_settings import (
+    PER_SECOND,
+    LogSource,
+    LogUnits,
+    Transmission,
+    check_transmissions,
+)
 from robotid.data.units import check_units, turned
 from robotid.robot.tree import Joint
 
 #: A log, or a file or a DataFrame with the columns of a log.
 Readable = Log | str | Path | Frame
 
-
+#: All formats of files; BAG and LEROBOT are folders, too.
+FORMATS = (CSV, PARQUET, NPZ, HDF5, MAT, BAG)
+_READ = {suffix: form for form in FORMATS for suffix in form.suffixes}
+_WRITTEN = {suffix: form.write for form in FORMATS for suffix in form.written if form.write}
+_LONGEST_NAME = 1000  # characters of a column
 _SI = LogUnits()
 _WHOLE = LogSource()
 _SPARSE = 0.02  # share of rows without a value from which a column has another rate
@@ -255,8 +275,7 @@ class LogLayout:
             for joint, own in zip(self.joints, is_angle, strict=True)
         ]
         first, scale = np.array(scales).T
-        si: Array = first + scale * values if kind in ("q", "qref") else scale * values
-        return si
+        return np.asarray(first + scale * values if kind in ("q", "qref") else scale * values)
 
     def _of_joints(self, kind: str, values: Array) -> Array:
         """Return values of joints; those of motors are converted by their transmission."""
@@ -336,16 +355,16 @@ def lay_out(
         needs, notes, {*chain.from_iterable(of_base.values()), *opened.sensors}, passive,
         tuple(robot), partial(_moves, opened, units, prismatic),
     )  # fmt: skip
-    joints = [joint for joint in joints if joint not in passive or finder.has_position(joint)]
+    joints = [joint for joint in joints if joint not in passive or finder.has("q", joint)]
     finder = replace(finder, joints=tuple(joints))
     if base.wrenches and needs in ("torque", "any") and not any(map(finder.has_torque, joints)):
         finder = replace(finder, needs="motion")
-    found = finder.find_all() | of_base  # names of columns by kind
+    by_kind = finder.find_all() | of_base  # names of columns by kind
     layout = LogLayout(
         path=str(Path(path)) if isinstance(path, str | Path) else "",
         joints=tuple(joints),
-        columns=found,
-        factors=finder.factors(found.get("tau", [])),
+        columns=by_kind,
+        factors=finder.factors(by_kind.get("tau", [])),
         units=units,
         prismatic=tuple(prismatic),
         source=source,
@@ -358,7 +377,7 @@ def lay_out(
         assumed=finder.reading.assumed,
         turning=tuple(joint.name for joint in robot if joint.turns_freely),
     )
-    return layout, with_even_stamps(opened, found["time"][0], source.stamp)
+    return layout, with_even_stamps(opened, by_kind["time"][0], source.stamp)
 
 
 def _opened(path: str | Path | Frame, source: LogSource) -> tuple[str, Table]:
@@ -422,3 +441,70 @@ def write_log(log: Log, path: str | Path) -> None:
             table |= {f"{kind}_{joint}": values[:, j] for j, joint in enumerate(log.joints)}
     table |= table_of_base(log.base, log.contacts, log.wrenches)
     write_columns(table, Path(path))
+
+
+def open_table(path: Path, source: LogSource) -> Table:
+    """Return the table in a file; faults of a column are reported when it is read."""
+    if (dataset := dataset_of(path)) is not None:
+        if source.topic not in (None, path.name):
+            raise SettingsError(
+                f"log.topic is {source.topic!r}, but the log is {path.name} of {dataset.name}; "
+                "leave topic out"
+            )
+        path, source = dataset, replace(source, topic=path.name)
+    form = _format_of(path)
+    if source.command is not None and form is not BAG:
+        raise SettingsError(
+            f"log.command is {source.command!r}, the topic of a bag, but {path.name} is no bag; "
+            "write the commands to columns, as qref_<joint>"
+        )
+    table = with_stated_names(form.open(path, source), path.name, source.names)
+    if not form.topics:
+        table = with_standard_names(table, path.name, f"{path.suffix} files", source)
+    table = with_time(table, source.rate)
+    for name in table.names:
+        if len(name) > _LONGEST_NAME:
+            raise DataError(
+                f"{path.name}: a column has a name of {len(name)} characters, {name[:40]!r}..., "
+                f"wanted at most {_LONGEST_NAME}; rename it"
+            )
+    return table
+
+
+def _format_of(path: Path) -> Format:
+    """Return the format of a log that exists."""
+    if path.is_dir():
+        return LEROBOT if (path / DATASET).is_file() else BAG
+    suffix = path.suffix.lower()
+    if path.exists() and suffix not in _READ:
+        raise DataError(
+            f"{path.name}: the suffix is {suffix!r}, wanted a log file of type "
+            f"{_alternatives(list(_READ))}, or the folder of a ROS 2 bag or of a LeRobot dataset; "
+            "convert it"
+        )
+    if not path.is_file():
+        raise DataError(missing_file(path, "log file"))
+    return _READ[suffix]
+
+
+def write_columns(table: Mapping[str, Array], path: Path) -> None:
+    """Write columns (N,) to a file, at once or not at all; they are read exactly as written."""
+    write = _WRITTEN[check_suffix(path)]
+    with written_whole(path) as temporary:
+        write(table, temporary)
+
+
+def check_suffix(path: Path, what: str = "logs", *, also: Sequence[str] = ()) -> str:
+    """Return the suffix of a file to write; used before its content is computed."""
+    suffix = path.suffix.lower()
+    if suffix not in _WRITTEN:
+        raise DataError(
+            f"{path.name}: {what} are written as {_alternatives([*_WRITTEN, *also])} files, not "
+            f"{suffix!r}"
+        )
+    return suffix
+
+
+def _alternatives(words: list[str]) -> str:
+    """Return words with commas, and "or" before the last."""
+    return f"{', '.join(words[:-1])} or {words[-1]}"

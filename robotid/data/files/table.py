@@ -6,17 +6,18 @@ stamps with equal steps are columns that are computed from others.
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
+from importlib import import_module
 from itertools import chain
 from pathlib import Path
 from typing import Any, Protocol, TypeGuard
 
 import numpy as np
 
-from robotid.base.exceptions import DataError, RobotIdError
+from robotid.base.exceptions import DataError, MissingDependencyError, RobotIdError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.data.files.columns import is_clock, named_by_row, quantity_of
@@ -80,11 +81,8 @@ class Table:
 
     def with_columns(self, columns: Mapping[str, Column], names: Sequence[str]) -> "Table":
         """Return a table in which some columns are computed, and the names of all its columns."""
-
-        def read(wanted: Sequence[str]) -> dict[str, Array]:
-            return _computed(columns, wanted, 0, self.read)
-
         rows = None if self.rows is None else _ComputedRows(self.rows, columns)
+        read = partial(_computed, columns, first=0, read=self.read)
         return replace(self, names=list(names), read=read, rows=rows)
 
     def with_names(self, names: Mapping[str, str]) -> "Table":
@@ -134,10 +132,9 @@ class _ComputedRows(RowReader):
             row += len(blocks[0][0])
 
     def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
-        def read(names: Sequence[str]) -> dict[str, Array]:
-            return self.rows.read(names, first, stop, near)
-
-        return _computed(self.columns, wanted, first, read)
+        return _computed(
+            self.columns, wanted, first, lambda names: self.rows.read(names, first, stop, near)
+        )
 
 
 def _computed(
@@ -277,32 +274,18 @@ def with_even_stamps(table: Table, column: str, stamp: str = "even") -> Table:
         return table
 
     @cache
-    def line() -> tuple[float, float]:
-        return _line(values for values, _ in table.reader([column]).scan(column))
+    def line() -> Array:
+        blocks = (values for values, _ in table.reader([column]).scan(column))
+        t = np.concatenate([np.empty(0), *blocks])
+        if len(t) < 2:
+            return np.array([0.0, *t])
+        slope, start = np.polyfit(np.arange(len(t)), t - t[0], 1)
+        return np.array([slope, start + t[0]])
 
     def stamps(row: int, t: Array) -> Array:
-        start, step = line()
-        even: Array = start + step * np.arange(row, row + len(t))
-        return even
+        return np.polyval(line(), np.arange(row, row + len(t)))
 
     return table.with_columns({column: Column((column,), stamps)}, table.names)
-
-
-def _line(blocks: Iterable[Array]) -> tuple[float, float]:
-    """Return the first value and the step of the least-squares line through values by row."""
-    count, first = 0, 0.0
-    sums = np.zeros(4)  # of row, value, row * value, row^2
-    for block in blocks:
-        if not count and len(block):
-            first = float(block[0])
-        row, t = np.arange(count, count + len(block), dtype=float), block - first
-        sums += row.sum(), t.sum(), row @ t, row @ row
-        count += len(block)
-    if count < 2:
-        return first, 0.0
-    row, t, both, square = sums / count
-    step = float((both - row * t) / (square - row**2))
-    return first + float(t - step * row), step
 
 
 def choose(where: str, candidates: Sequence[str], noun: str, listing: str) -> str:
@@ -314,6 +297,14 @@ def choose(where: str, candidates: Sequence[str], noun: str, listing: str) -> st
         f"{where} has {len(names)} {noun}: {listed(names)}; {listing}. State one: topic = "
         f'"{names[0]}" (job file table [log], CLI --topic, Python source=LogSource(topic=...))'
     )
+
+
+def load_package(purpose: str, extra: str, *modules: str) -> list[Any]:
+    """Return modules of a package that an extra of robotid installs."""
+    try:
+        return [import_module(name) for name in modules]
+    except ImportError as error:
+        raise MissingDependencyError(purpose, modules[0].partition(".")[0], extra) from error
 
 
 @contextmanager

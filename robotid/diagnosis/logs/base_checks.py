@@ -16,7 +16,6 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import DIFFERS
-from robotid.dynamics.completed_logs import closed_log, with_contacts
 from robotid.dynamics.constraint_rows import (
     constraint_jacobian,
     force_basis,
@@ -24,6 +23,7 @@ from robotid.dynamics.constraint_rows import (
     without_forces,
 )
 from robotid.dynamics.prediction import predict
+from robotid.dynamics.prepared_logs import closed_log, with_contacts
 from robotid.robot.constraints import Contact, link_positions
 from robotid.robot.model import RobotModel
 

@@ -8,7 +8,8 @@ from robotid.base.findings import Finding, listed, quoted
 from robotid.base.text import seconds
 from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
-from robotid.data.measured_velocity import (
+from robotid.data.signal_settings import SignalSettings
+from robotid.data.units import (
     COARSE,
     LARGEST_LAG,
     is_trustworthy,
@@ -16,7 +17,6 @@ from robotid.data.measured_velocity import (
     unlike_velocities,
     velocity_lags,
 )
-from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import AGREES, BEYOND_NOISE, DIFFERS, SHARE_OF_ROWS
 from robotid.robot.parameters import ParameterLayout
@@ -281,6 +281,13 @@ def check_rest(log: Log, motion: Trajectory, layout: ParameterLayout) -> Iterato
         code = "static_joint" if extent < STATIC else "hardly_moves"
         if extent < _HARDLY[unit] or share < MOVING:
             yield finding(code, log.name, joint, range=extent, moving_share=share, unit=unit)
+
+
+def distance(t: Array, instants: Array) -> Array:
+    """Return the distance of times from the nearest of some instants, shape as t [s]."""
+    bounds = np.concatenate([[-np.inf], instants, [np.inf]])
+    after = np.searchsorted(bounds, t)
+    return np.asarray(np.minimum(t - bounds[after - 1], bounds[after] - t))
 
 
 def runs_of(flags: Array) -> list[tuple[int, int]]:

@@ -6,17 +6,15 @@ identification unless its code is ignored.
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from robotid.base.exceptions import DataError, RobotIdError
 from robotid.base.findings import Finding, by_severity, toml_key
-from robotid.base.settings import require_kind
 from robotid.base.typing import Array
-from robotid.data.alike_motions import REPEATED, repeated_share
-from robotid.data.files.read import Readable, read_logs
-from robotid.data.log import Log, Trajectory
+from robotid.data.log import REPEATED, Log, Trajectory, repeated_share
 from robotid.data.signal_settings import LogUnits, SignalSettings
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.logs.base_checks import check_base
@@ -29,13 +27,12 @@ from robotid.diagnosis.logs.channels import (
 )
 from robotid.diagnosis.logs.command_channels import check_commands
 from robotid.diagnosis.logs.hypotheses import Probe, smooth_motion, take_probe
-from robotid.diagnosis.logs.torque_checks import Segments, check_payload_change, check_torques
+from robotid.diagnosis.logs.torque_checks import check_payload_change, check_torques, reductions_of
 from robotid.diagnosis.logs.torque_delay import check_torque_delay
 from robotid.diagnosis.urdf.inertials import assumed_inertials, explained_by_assumed, rounded_angles
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
-from robotid.dynamics.constraint_rows import logged_base
-from robotid.dynamics.factors import compress, merge
-from robotid.dynamics.used_rows import base_problem, independent_share, row_mask
+from robotid.dynamics.factors import Reduction, compress, merge
+from robotid.dynamics.prepared_logs import base_problem, independent_share, row_mask
 from robotid.estimation.estimators import WLS, Estimate
 from robotid.estimation.estimators.determination import (
     Determination,
@@ -50,30 +47,10 @@ _ROWS = 5000  # of a log, from which its excitation is computed
 _FAR = 2 * np.pi  # number in a log above which a position may be a percentage
 
 
-def check_logs(
-    model: RobotModel,
-    logs: Readable | Sequence[Readable],
-    *,
-    validation: Readable | Sequence[Readable] = (),
-    signals: SignalSettings | None = None,
-) -> tuple[Finding, ...]:
-    """Return the faults of logs, or of paths or DataFrames with their columns, errors first."""
-    require_kind(model, RobotModel, "model", "a robotid.RobotModel")
-    require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
-    first, second = (
-        read_logs(
-            some, model.joints, prismatic=model.layout.prismatic, needs="any",
-            base=logged_base(model), passive=model.passive, robot=model.tree.movable,
-        )
-        for some in (logs, validation)
-    )  # fmt: skip
-    return diagnose(model, first, second, signals or SignalSettings())
-
-
 def diagnose(
     model: RobotModel, fitted: Sequence[Log], validation: Sequence[Log], signals: SignalSettings
 ) -> tuple[Finding, ...]:
-    """Check logs that are in memory, as ``check_logs`` does."""
+    """Check logs that are in memory; the findings have errors first."""
     # friction with an internal state is not examined here
     model = with_assumed_inertials(model.with_terms({}))
     findings = assumed_inertials(model)
@@ -82,14 +59,18 @@ def diagnose(
     probes = [probe for _, probe in motions[: len(fitted)] if probe is not None]
     mapping = structural_mapping(model) if probes else None
     moving = [probe.motion for probe in probes]
-    segments = Segments(model, mapping, moving, signals.min_velocity) if mapping else None
+    segments: list[Reduction] = []  # of the fitted motions, made if they are compared
     for log, (motion, probe) in zip(validation, motions[len(fitted) :], strict=True):
         share = 0.0 if motion is None else repeated_share(first, motion)
         if share >= REPEATED:
             findings.append(finding("repeated_motion", log.name, share=share))
-        if probe is not None and segments is not None:
-            other = replace(segments, motions=[probe.motion])
-            findings += check_payload_change(segments, other, signals, log.name)
+        if probe is not None and mapping is not None:
+            reduced = partial(reductions_of, model, mapping, min_velocity=signals.min_velocity)
+            segments = segments or list(reduced(moving))
+            seconds = sum(float(np.ptp(m.t)) for m in (*moving, probe.motion))
+            independent = 2.0 * (signals.cutoff or np.inf) * seconds
+            both = segments, list(reduced([probe.motion]))
+            findings += check_payload_change(model, mapping, *both, independent, log.name)
     if mapping is not None:
         names = ", ".join(log.name for log in fitted)
         findings += check_excitation(model, mapping, moving, signals, names)

@@ -10,7 +10,7 @@ import numpy as np
 from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
 from robotid.data.log import Log
-from robotid.data.measured_velocity import quantum
+from robotid.data.units import quantum
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import CORRELATED, DIFFERS, SHARE_OF_ROWS, SIGNIFICANT, connected
 from robotid.diagnosis.logs.channels import runs_of

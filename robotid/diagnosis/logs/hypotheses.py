@@ -16,8 +16,12 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process, resolve, unwrap
 from robotid.diagnosis.decisions import TINY
 from robotid.diagnosis.logs.channels import AT_REST, ZERO
-from robotid.dynamics.drive_columns import drive_values, friction_directions, friction_speeds
-from robotid.dynamics.torque import carried_columns
+from robotid.dynamics.rows import (
+    drive_values,
+    friction_directions,
+    friction_speeds,
+    inertial_rows,
+)
 from robotid.robot.model import GRAVITY, RobotModel
 
 #: Decrease of the misfit from which another gravity is reported.
@@ -72,7 +76,7 @@ class Probe:
     @cached_property
     def _ten(self) -> Array:
         """Columns of the ten parameters of each carried body, shape (N, bodies carried, 10)."""
-        columns = carried_columns(self.model, self.q, self.v, self.a)
+        columns = inertial_rows(self.model, self.q, self.v, self.a).values.T
         return columns.reshape(len(columns), -1, 10)
 
     def _by_link(self, ten: Array) -> Array:
@@ -92,7 +96,7 @@ class Probe:
         """Torques of links at rest, per m/s^2 of gravity in x, y, z, (3, N, n, bodies)."""
         rest = np.zeros_like(self.v)
         models = [self.model.with_gravity(axis) for axis in np.eye(3)]
-        columns = (carried_columns(model, self.q, rest, rest) for model in models)
+        columns = (inertial_rows(model, self.q, rest, rest).values.T for model in models)
         return np.array([self._by_link(x.reshape(len(x), -1, 10)) for x in columns])
 
     @cached_property

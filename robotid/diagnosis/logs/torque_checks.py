@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import scipy.special
@@ -10,7 +9,6 @@ import scipy.special
 from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
-from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import BEYOND_NOISE, NO_ERROR_OF_MASSES, ROWS, SIGNIFICANT, TINY
 from robotid.diagnosis.logs.channels import STATIC
@@ -27,8 +25,8 @@ from robotid.diagnosis.logs.hypotheses import (
 )
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Reduction, compress_segments
+from robotid.dynamics.prepared_logs import base_problem, row_mask
 from robotid.dynamics.rows import keep_inertial_rows
-from robotid.dynamics.used_rows import base_problem, row_mask
 from robotid.estimation.estimators.two_runs import payload_runs
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import payload_spread, prior_spread
@@ -381,51 +379,41 @@ def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Fin
     )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class Segments:
-    """Motions of a robot, and the reduced least-squares problems of their segments."""
-
-    model: RobotModel
-    mapping: BaseMapping  # Standard to base parameters
-    motions: Sequence[Trajectory]
-    min_velocity: float  # Lower bound on the speed of the rows that are used
-
-    @cached_property
-    def reductions(self) -> tuple[Reduction, ...]:
-        """The reduced problem of each segment, in order."""
-        return tuple(part for motion in self.motions for part in self._of(motion))
-
-    def _of(self, motion: Trajectory) -> Iterator[Reduction]:
+def reductions_of(
+    model: RobotModel, mapping: BaseMapping, motions: Sequence[Trajectory], min_velocity: float
+) -> Iterator[Reduction]:
+    """Yield the reduced least-squares problem of each segment of motions, in order."""
+    for motion in motions:
         thin = motion.every(max(1, len(motion.t) // ROWS))
-        keep_inertial_rows(self.model, thin)  # used for the excitation, too
+        keep_inertial_rows(model, thin)  # used for the excitation, too
         count = int(np.clip(np.ptp(thin.t) / _SEGMENT, 1, _SEGMENTS))
         length = -(-len(thin.t) // count)
-        rows = row_mask(self.model, thin, self.min_velocity)
-        problem = base_problem(self.model, self.mapping, thin, rows, compiled=False)
+        problem = base_problem(
+            model, mapping, thin, row_mask(model, thin, min_velocity), compiled=False
+        )
         for i, factors in enumerate(compress_segments(problem, length)):
             part = thin.at(slice(i * length, (i + 1) * length))
             yield Reduction(factors, part.squares, len(part.t))
 
 
 def check_payload_change(
-    fitted: Segments, validation: Segments, signals: SignalSettings, name: str
-) -> Iterator[Finding]:
+    model: RobotModel, mapping: BaseMapping, fitted: Sequence[Reduction],
+    validation: Sequence[Reduction], independent: float, name: str,
+) -> Iterator[Finding]:  # fmt: skip
     """Yield a warning "payload_change" if a validation log has another load than the fitted ones.
 
     Both are fitted together, with free parameters of all links and a load in the last link of the
-    validation log only. The load is reported if the same robot with it fits both.
+    validation log only. The load is reported if the same robot with it fits both. ``independent``
+    is the number of independent samples.
     """
-    model, mapping, layout = fitted.model, fitted.mapping, fitted.model.layout
-    first, second = fitted.reductions, validation.reductions
-    every = (*first, *second)
+    layout, every = model.layout, (*fitted, *validation)
     squares, samples = sum(r.squares for r in every), sum(r.samples for r in every)
     size = payload_spread(model)
     last = mapping.K[:, layout.n_inertial - 10 : layout.n_inertial]
-    seconds = sum(float(np.ptp(motion.t)) for x in (fitted, validation) for motion in x.motions)
     runs = payload_runs(
-        first, second, layout, mapping.K, model.standard_parameters(),
+        fitted, validation, layout, mapping.K, model.standard_parameters(),
         prior_spread(model, np.asarray(squares), samples), (last, np.full(10, np.nan), size),
-        share=min(1.0, 2.0 * (signals.cutoff or np.inf) * seconds / samples),
+        share=min(1.0, independent / samples),
     )  # fmt: skip
     theta, covariance = runs.alike()
     least = SIGNIFICANT * float(np.sqrt(covariance[-10, -10]))

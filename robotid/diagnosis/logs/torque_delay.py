@@ -4,7 +4,7 @@ The regressor is computed from a motion with three times the bandwidth. The same
 applied to torque and regressor, because a filter of only one of them looks like a delay.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -17,9 +17,9 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import low_pass
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import BEYOND_NOISE, ROUNDING, ROWS
-from robotid.diagnosis.logs.channels import AT_REST, MOVING
+from robotid.diagnosis.logs.channels import AT_REST, MOVING, distance
 from robotid.diagnosis.logs.hypotheses import coupled_columns, smooth_motion
-from robotid.dynamics.torque import carried_columns
+from robotid.dynamics.rows import inertial_rows
 from robotid.robot.model import RobotModel
 
 _LONGEST = 0.1  # [s] largest delay of the grid
@@ -105,12 +105,12 @@ def _at(delay: float, values: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """Filtered torques of contiguous rows of a motion, and the columns that may explain them."""
+    """Filtered torques at N instants of a motion, and the columns that may explain them."""
 
     inertial: Array  # (N, columns), of the bodies that each joint carries, joint after joint
     drive: Array  # (N, n, k), of each joint's inertia, frictions and position, of coupled drives
     steady: Array  # (N, n), whether the drive is far from stiction
-    delayed: Array  # (n, delays, N), torques at each delay of the grid after the instants
+    delayed: Array  # (N, delays, n), torques at each delay of the grid after the instants
     load: Array  # (N, n), friction that grows with the URDF's torque, for a coefficient of 1
 
 
@@ -158,13 +158,16 @@ def _misfit(
     """Return the misfit of the joints that move enough, None if they are less than half of all."""
     step = float(np.median(np.diff(motion.t)))
     every = max(1, int(period / (step * _OVERSAMPLED)))
-    windows = [
+    parts = [
         _window(model, motion, part, step, every, signals, period)
         for part in _segments(model, motion, every)
     ]
+    if not parts:
+        return None
+    window = _Window(*map(np.concatenate, zip(*parts, strict=True)))
     ends = np.cumsum(model.support[:, : model.layout.n_inertial].sum(axis=1)).tolist()
     columns = [slice(*pair) for pair in pairwise([0, *ends])]
-    squares = [_squares(windows, j, own) for j, own in enumerate(columns)] if windows else []
+    squares = [_squares(window, j, own) for j, own in enumerate(columns)]
     used = [one for one in squares if one is not None]
     if len(used) < max(2.0, len(columns) / 2):
         return None
@@ -196,7 +199,7 @@ def _units(model: RobotModel) -> Array:
 def _window(
     model: RobotModel, motion: Trajectory, rows: Array, step: float, every: int,
     signals: SignalSettings, period: float,
-) -> _Window:  # fmt: skip
+) -> tuple[Array, ...]:  # fmt: skip
     """Return the filtered columns at every n-th of contiguous rows, without the ends."""
     t, q, v, coarse = motion.t[rows], motion.q[rows], motion.v[rows] / _units(model), rows[::every]
     edge = max(_LONGEST, _SETTLED * period)
@@ -209,7 +212,7 @@ def _window(
     own = np.stack([motion.a[rows], v, *signs, v * np.abs(v), *waves], axis=2)
     own = low_pass(own, 1 / step, signals)[::every][inner]
     state = motion.q[coarse], motion.v[coarse], motion.a[coarse]
-    inertial, coupled = (columns(model, *state) for columns in (carried_columns, coupled_columns))
+    inertial, coupled = inertial_rows(model, *state).values.T, coupled_columns(model, *state)
     load = _interpolated(motion.t[coarse], np.abs(_of_urdf(model, inertial)), t) * signs[0]
     load = low_pass(load, 1 / step, signals)[::every][inner]
     inertial, coupled = (
@@ -218,15 +221,15 @@ def _window(
     at = motion.t[coarse[inner]]
     is_reversal = np.diff(np.sign(v), axis=0, append=np.sign(v[-1:])) != 0
     slow = is_reversal | (np.abs(v) < _SLOW)
-    steady = [_distance(at, t[slow[:, j]]) > _AWAY * period for j in range(v.shape[1])]
+    steady = [distance(at, t[slow[:, j]]) > _AWAY * period for j in range(v.shape[1])]
     tau = low_pass(motion.tau[rows], 1 / step, signals)
-    delayed = np.moveaxis(_interpolated(t, tau, at + _GRID[:, None]), 2, 0)
+    delayed = _interpolated(t, tau, at + _GRID[:, None]).swapaxes(0, 1)
     drive = np.concatenate([own, coupled], axis=2)
-    return _Window(inertial, drive, np.column_stack(steady), delayed, load)
+    return inertial, drive, np.column_stack(steady), delayed, load
 
 
 def _of_urdf(model: RobotModel, carried: Array) -> Array:
-    """Return the torque of the URDF's bodies from ``carried_columns``, shape (N, n)."""
+    """Return the torque of the URDF's bodies from their columns, shape (N, n)."""
     size = model.layout.n_inertial
     support, pi = model.support[:, :size], model.standard_parameters()[:size]
     ends = np.cumsum(support.sum(axis=1))
@@ -243,28 +246,18 @@ def _interpolated(t: Array, values: Array, times: Array) -> Array:
     return np.asarray(CubicSpline(t, values)(times))
 
 
-def _distance(at: Array, slow: Array) -> Array:
-    """Return the distance of each time from the nearest slow instant, shape as at [s]."""
-    bounds = np.concatenate([[-np.inf], slow, [np.inf]])
-    after = np.searchsorted(bounds, at)
-    return np.asarray(np.minimum(at - bounds[after - 1], bounds[after] - at))
-
-
-def _squares(windows: Sequence[_Window], j: int, own: slice) -> tuple[Array, Array, int] | None:
+def _squares(window: _Window, j: int, own: slice) -> tuple[Array, Array, int] | None:
     """Return the unexplained part of joint j's torque, and its instants.
 
     Its inertial columns are ``own``. The parts have shape (blocks, delays); in the second one
     friction grows with the load, too. None for a joint that moves in too few instants.
     """
-    steady = [window.steady[:, j] for window in windows]
-    used = sum(map(np.count_nonzero, steady))
-    if used < max(_FEW, MOVING * sum(map(len, steady))):
+    at = window.steady[:, j]
+    used = int(np.count_nonzero(at))
+    if used < max(_FEW, MOVING * len(at)):
         return None
-    pairs = list(zip(windows, steady, strict=True))
-    inertial = np.concatenate([window.inertial[at, own] for window, at in pairs])
-    drive = np.concatenate([window.drive[at, j] for window, at in pairs])
-    load = np.concatenate([window.load[at, j] for window, at in pairs])
-    tau = np.concatenate([window.delayed[j][:, at] for window, at in pairs], axis=1)
+    inertial, drive, load = window.inertial[at, own], window.drive[at, j], window.load[at, j]
+    tau = np.ascontiguousarray(window.delayed[at, :, j].T)
     tau -= tau.mean(axis=1, keepdims=True)  # (delays, N)
     size = np.einsum("dk,dk->d", tau, tau)
     if size.min() <= 0:

@@ -86,19 +86,19 @@ def explain_residual(
         return (), ()
     misfits = find_misfits(sample)
     possible = list(_alterations(model, fit.standard, sample))
-    found = list(_found(fit, sample, possible))
-    if misfits and found:
-        altered = np.concatenate([one.alteration.Z for one in found], axis=2)
+    altered_by = list(_found(fit, sample, possible))
+    if misfits and altered_by:
+        altered = np.concatenate([one.alteration.Z for one in altered_by], axis=2)
         lacking = _columns(misfits, sample)
         if _left(sample, altered) < _left(sample, lacking):
             alone = {(misfit.joint, misfit.term.code) for misfit in misfits}
-            remaining = find_misfits(found[0].corrected.with_columns(altered))
+            remaining = find_misfits(altered_by[0].corrected.with_columns(altered))
             misfits = tuple(m for m in remaining if (m.joint, m.term.code) in alone)
         else:
-            among = {one.alteration for one in found}
+            among = {one.alteration for one in altered_by}
             retested = _found(fit, sample.with_columns(lacking), possible)
-            found = [one for one in retested if one.alteration in among]
-    return misfits, tuple(one.finding for one in found)
+            altered_by = [one for one in retested if one.alteration in among]
+    return misfits, tuple(one.finding for one in altered_by)
 
 
 def _columns(misfits: Sequence[Misfit], sample: Sample) -> Array:

@@ -24,9 +24,10 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.diagnosis.decisions import FAMILY_P_VALUE, FEWEST, OUTLIER, SEGMENTS, SHORTEST, p_value
+from robotid.diagnosis.logs.channels import distance
 from robotid.dynamics.constraint_rows import without_forces
+from robotid.dynamics.prepared_logs import independent_share
 from robotid.dynamics.torque import trajectory_regressor
-from robotid.dynamics.used_rows import independent_share
 from robotid.estimation.fitting.drive_terms import JointMotion, joint_motions, travelled
 from robotid.estimation.fitting.evaluation import Evaluation, Recording
 from robotid.estimation.fitting.fitted import Solution
@@ -332,13 +333,8 @@ def _is_steady(recording: Recording) -> Array:
     if signals.cutoff is None:
         return np.ones(motion.v.shape, dtype=bool)
     slow = (np.abs(motion.v) < signals.min_velocity) | (travelled(motion) == 0.0)
-    steady = np.empty(slow.shape, dtype=bool)
-    for j, at in enumerate(slow.T):
-        times = np.concatenate([[-np.inf], motion.t[at], [np.inf]])
-        after = np.searchsorted(times, motion.t, side="right")
-        near = np.minimum(motion.t - times[after - 1], times[after] - motion.t)
-        steady[:, j] = near > _NEAR / signals.cutoff
-    return steady
+    t, near = motion.t, _NEAR / signals.cutoff
+    return np.column_stack([distance(t, t[at]) > near for at in slow.T])
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,9 +29,9 @@ from robotid.diagnosis.decisions import (
     SHORTEST,
     p_value,
 )
-from robotid.dynamics.drive_columns import drive_values, friction_directions
 from robotid.dynamics.prediction import predict, rigid_parts
-from robotid.dynamics.used_rows import independent_share
+from robotid.dynamics.prepared_logs import independent_share
+from robotid.dynamics.rows import drive_values, friction_directions
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.fitted import Fit
 from robotid.robot.model import RobotModel

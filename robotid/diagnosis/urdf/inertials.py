@@ -64,11 +64,11 @@ def assumed_inertials(model: RobotModel) -> list[Finding]:
     return findings
 
 
-def explained_by_assumed(model: RobotModel, found: Finding) -> bool:
+def explained_by_assumed(model: RobotModel, one: Finding) -> bool:
     """Return whether a finding compares the torque of a joint with inertials that are assumed."""
-    if found.code not in _OF_MASSES:
+    if one.code not in _OF_MASSES:
         return False
-    rows = [name in found.joints for name in model.row_names]
+    rows = [name in one.joints for name in model.row_names]
     carried = model.support[rows if any(rows) else slice(None)].any(axis=0)
     return bool((carried & model.layout.owned_by(assumed_masses(model))).any())
 
@@ -78,12 +78,12 @@ def impossible_inertials(model: RobotModel) -> list[Finding]:
     inertials = model.tree.inertials
     effect = "; a consistent fit uses the nearest possible body instead"
     return [
-        found.reworded(severity="warning", remedy=found.remedy + effect)
+        one.reworded(severity="warning", remedy=one.remedy + effect)
         for place in link_places(model)
         if place.body >= 0 and place.link in inertials
         and model.layout.bodies[place.body] not in model.assumed
-        for found in impossible_inertial(place.link, inertials[place.link], matters=False)
-        if found.severity == "error"
+        for one in impossible_inertial(place.link, inertials[place.link], matters=False)
+        if one.severity == "error"
     ]  # fmt: skip
 
 

@@ -67,11 +67,12 @@ class Inspection:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the inspection as plain values, as ``robotid inspect --json`` prints it."""
-        found = self.structure
+        structure = self.structure
         return {
             "robot": self.robot,
             "joints": list(self.joints),
-            "structure": found and vars(found) | {"undetermined": list(found.undetermined)},
+            "structure": structure
+            and vars(structure) | {"undetermined": list(structure.undetermined)},
             "base_groups": list(self.base_groups),
             "findings": [_plain(one) for one in self.findings],
         }
@@ -220,9 +221,9 @@ def _link_findings(model: RobotModel) -> Iterator[Finding]:
             yield finding("fixed_lumped", subject=f"link {link}", link=link, others=others)
 
 
-def _plain(found: Finding) -> Mapping[str, Any]:
-    kind, name = found.where.split(" ", 1)
+def _plain(one: Finding) -> Mapping[str, Any]:
+    kind, name = one.where.split(" ", 1)
     place = {} if kind == "file" else {kind: name}
-    evidence = {key: float(value) for key, value in found.evidence.items()}
-    plain = {"code": found.code, "severity": found.severity, **place, "message": found.message}
+    evidence = {key: float(value) for key, value in one.evidence.items()}
+    plain = {"code": one.code, "severity": one.severity, **place, "message": one.message}
     return {**plain, "evidence": evidence}

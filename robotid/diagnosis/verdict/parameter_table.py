@@ -23,20 +23,20 @@ _PINOCCHIO = ("m", "cx", "cy", "cz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 _ORDER = [_PINOCCHIO.index(term) for term in CENTRAL_TERMS]
 
 
-def parameter_entries(found: Identified) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+def parameter_entries(fit: Identified) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Return the parameters of the bodies and of the drives, as in result.json."""
-    layout, sources, at_bound = found.model.layout, found.sources, found.at_bound
-    errors, ends, quantile = found.standard_error, found.standard_interval, found.standard_quantile
-    pairs = correlated_parameters(found)
+    layout, sources, at_bound = fit.model.layout, fit.sources, fit.at_bound
+    errors, ends, quantile = fit.standard_error, fit.standard_interval, fit.standard_quantile
+    pairs = correlated_parameters(fit)
     entries = [
         {
             "name": name,
-            "value": float(found.standard[i]),
+            "value": float(fit.standard[i]),
             "std_error": finite(errors[i]),
             "quantile": float(quantile[i]) if math.isfinite(errors[i]) else None,
             "interval_95": [finite(end) for end in ends[i]],
             "unit": layout.units[i],
-            "prior": float(found.prior[i]),
+            "prior": float(fit.prior[i]),
             "source": sources[i],
             "at_bound": bool(at_bound[i]),
             **(
@@ -79,9 +79,9 @@ def correlated_sets(C: Array, own: Sequence[int]) -> list[list[int]]:
     return [[own[k] for k in group] for group in groups]
 
 
-def correlated_parameters(found: Identified) -> dict[int, tuple[int, float]]:
+def correlated_parameters(fit: Identified) -> dict[int, tuple[int, float]]:
     """Return drive parameters strongly correlated with another parameter of the same drive."""
-    layout, C, at_bound = found.model.layout, found.standard_covariance, found.at_bound
+    layout, C, at_bound = fit.model.layout, fit.standard_covariance, fit.at_bound
     pairs = {}
     for drive in range(len(layout.drives)):
         own = [
@@ -105,21 +105,21 @@ class CentralParameters:
     half: Array  # Half-widths of their 95 % intervals, shape (n, 10); inf if there is none
 
 
-def central_parameters(found: Fit) -> CentralParameters:
+def central_parameters(fit: Fit) -> CentralParameters:
     """Return the parameters of each body about its centre of mass.
 
     Standard errors are those of the standard parameters, propagated to first order.
     """
-    n, size = len(found.model.layout.bodies), found.model.layout.n_inertial
-    pi, before = (x[:size].reshape(n, 10) for x in (found.standard, found.prior))
-    error = found.standard_error[:size]
-    quantile = found.standard_quantile[:size].reshape(n, 10).max(axis=1)
+    n, size = len(fit.model.layout.bodies), fit.model.layout.n_inertial
+    pi, before = (x[:size].reshape(n, 10) for x in (fit.standard, fit.prior))
+    error = fit.standard_error[:size]
+    quantile = fit.standard_quantile[:size].reshape(n, 10).max(axis=1)
     urdf, values, half = (np.full((n, 10), np.nan) for _ in range(3))
     for i in range(n):
         urdf[i], _ = _central(before[i])
         values[i], G = _central(pi[i])
         own = slice(10 * i, 10 * i + 10)
-        C = found.standard_covariance[own, own]
+        C = fit.standard_covariance[own, own]
         std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", G, C, G), 0.0))
         half[i] = np.where(np.isfinite(error[own]).all(), quantile[i] * std, np.inf)
     return CentralParameters(*(x[:, _ORDER] for x in (urdf, values, half)))

@@ -335,45 +335,44 @@ class ScaleCheck:
         return figures | {"agrees": self.agrees, "message": self.message}
 
 
-def check_scale(found: Fit) -> ScaleCheck:
+def check_scale(fit: Fit) -> ScaleCheck:
     """Compare gravity and masses of a result with the URDF's.
 
     With g_u and g the gravity torques of the URDF and of the result over the fitted poses, a
     joint's ratio is g_u . g / g_u . g_u. It is linear in the base parameters: the covariance of the
     result gives its standard error.
     """
-    model, size = found.model, found.model.layout.n_inertial
-    before, after = (float(pi[:size:10].sum()) for pi in (found.prior, found.standard))
-    errors = [found.metrics(name).per_joint for name in ("estimate", "wls")]
+    model, size = fit.model, fit.model.layout.n_inertial
+    before, after = (float(pi[:size:10].sum()) for pi in (fit.prior, fit.standard))
+    errors = [fit.metrics(name).per_joint for name in ("estimate", "wls")]
     follows = all(
-        errors[0][j].rmse <= _HELD_BACK * free.rmse or j in found.overfitted
+        errors[0][j].rmse <= _HELD_BACK * free.rmse or j in fit.overfitted
         for j, free in errors[1].items()
     )
     plain = ScaleCheck(
-        masses=(before, after, 0.0), stated=stated_mass(found), friction=friction_shares(found),
-        follows=follows, is_total_determined=determines_total_mass(found),
+        masses=(before, after, 0.0), stated=stated_mass(fit), friction=friction_shares(fit),
+        follows=follows, is_total_determined=determines_total_mass(fit),
     )  # fmt: skip
     if model.free_flyer:  # gravity loads its base with the whole mass
         ratio = after / before if before > 0 else 1.0
         return replace(plain, scale=ratio, factor=ratio, is_total_determined=True)
-    q = np.vstack([e.recording.trajectory.q for e in found.fitted])
+    q = np.vstack([e.recording.trajectory.q for e in fit.fitted])
     q = q[:: -(-len(q) // _POSES)]
     still = np.zeros_like(q)
     G = joint_torque_regressor(model, q, still, still).reshape(len(q), model.n_rows, -1)
     if model.loops:
         G = without_forces(loop_basis(model, q), G)
     last = G[:, :, size - 10 : size - 6]  # m, mcx, mcy, mcz of the last body
-    by_body, G = G[:, :, :size], G[:, :, found.mapping.independent]
-    at_rest = np.arange(len(found.prior)) < size
+    by_body, G = G[:, :, :size], G[:, :, fit.mapping.independent]
+    at_rest = np.arange(len(fit.prior)) < size
     of_urdf, of_result = (
-        G @ found.mapping.to_base(np.where(at_rest, pi, 0.0))
-        for pi in (found.prior, found.standard)
+        G @ fit.mapping.to_base(np.where(at_rest, pi, 0.0)) for pi in (fit.prior, fit.standard)
     )  # (N, n)
     load = np.sum(of_urdf**2, axis=0)
     if not load.any():
         return plain
-    K = found.mapping.K * at_rest
-    covariance = K @ found.standard_covariance @ K.T
+    K = fit.mapping.K * at_rest
+    covariance = K @ fit.standard_covariance @ K.T
     gravity, error, known = {}, {}, []
     for j in np.flatnonzero(load > _LOADED**2 * load.max()).tolist():
         w = of_urdf[:, j] @ G[:, j] / load[j]  # (b,), ratio = w beta
@@ -383,13 +382,13 @@ def check_scale(found: Fit) -> ScaleCheck:
             error[model.row_names[j]] = spread
             known.append(j)
     plain = replace(plain, gravity=gravity, gravity_error=error)
-    of_assumed = found.prior[:size:10][np.isin(model.layout.bodies, assumed_masses(model))]
+    of_assumed = fit.prior[:size:10][np.isin(model.layout.bodies, assumed_masses(model))]
     if of_assumed.sum() > AGREES * before:
         return replace(plain, assumed=len(of_assumed))
     common = None
     if len(known) > 1:
         A = np.einsum("nj,njk->jk", of_urdf[:, known], by_body[:, known]) / load[known, None]
-        common = common_factor(np.array([*gravity.values()]), A, found.prior[:size])
+        common = common_factor(np.array([*gravity.values()]), A, fit.prior[:size])
     factor = float(np.sum(of_urdf * of_result) / load.sum())
     P, u, g = last.reshape(-1, 4), of_urdf.reshape(-1), of_result.reshape(-1)
     alone = np.linalg.lstsq(P, g - u)[0]  # (4,), a payload
@@ -400,7 +399,7 @@ def check_scale(found: Fit) -> ScaleCheck:
     return replace(
         plain, scale=scale, factor=factor, unexplained=(rest[0], rest[1]), common=common,
         masses=(before, after, max(payload, 0.0)),
-        mass_error=float(np.sqrt(max(found.standard_covariance[:size:10, :size:10].sum(), 0.0))),
+        mass_error=float(np.sqrt(max(fit.standard_covariance[:size:10, :size:10].sum(), 0.0))),
     )  # fmt: skip
 
 
@@ -426,25 +425,25 @@ def common_factor(ratios: Array, sensitivity: Array, inertial: Array) -> tuple[f
     return factor, float(scipy.special.stdtrit(free, 0.975) * spread / np.linalg.norm(one))
 
 
-def friction_shares(found: Fit) -> dict[str, float]:
+def friction_shares(fit: Fit) -> dict[str, float]:
     """Return the share of friction in the RMS torque of each joint [-]; 0 of a torque that is 0."""
-    layout = found.model.layout
+    layout = fit.model.layout
     is_friction = [name.endswith((".viscous", ".coulomb")) for name in layout.names]
-    pi = np.where(is_friction, found.standard, 0.0)
-    motions = [e.recording.trajectory for e in found.fitted]
-    torque = np.vstack([predict(found.model, [pi], motion)[0] for motion in motions])
+    pi = np.where(is_friction, fit.standard, 0.0)
+    motions = [e.recording.trajectory for e in fit.fitted]
+    torque = np.vstack([predict(fit.model, [pi], motion)[0] for motion in motions])
     measured = np.vstack([motion.tau for motion in motions])
     torque, measured = np.linalg.norm([torque, measured], axis=1)
     share = np.divide(torque, measured, where=measured > 0.0, out=np.zeros_like(torque))
-    return dict(zip(found.model.row_names, share.tolist(), strict=True))
+    return dict(zip(fit.model.row_names, share.tolist(), strict=True))
 
 
-def stated_mass(found: Fit) -> StatedMass | None:
+def stated_mass(fit: Fit) -> StatedMass | None:
     """Return the check of the masses that the user states; None without one.
 
     A range wider than +- 5 % is a bound, not a statement. So is the mass of a pinned link.
     """
-    layout, bounds = found.model.layout, found.estimator.bounds
+    layout, bounds = fit.model.layout, fit.estimator.bounds
     stated = {f"mass of {link}": (link, pair) for link, pair in bounds.masses.items()}
     if bounds.total is not None:
         stated["total_mass"] = ("", bounds.total)
@@ -454,37 +453,37 @@ def stated_mass(found: Fit) -> StatedMass | None:
         if link not in bounds.pinned and centre > 0 and width <= AGREES * centre:
             masses = layout.owned_by([link]) if link else np.ones(len(layout.names), dtype=bool)
             names.append(name)
-            rows.append(_are_masses(found) * masses / centre)
+            rows.append(_are_masses(fit) * masses / centre)
             widths.append(width / centre)
-    return _checked(found, names, np.array(rows), np.array(widths)) if names else None
+    return _checked(fit, names, np.array(rows), np.array(widths)) if names else None
 
 
-def determines_total_mass(found: Fit) -> bool:
+def determines_total_mass(fit: Fit) -> bool:
     """Return whether torque alone determines the total mass within 5 %."""
-    masses = _are_masses(found).astype(float)
-    if not masses @ found.standard > 0:
+    masses = _are_masses(fit).astype(float)
+    if not masses @ fit.standard > 0:
         return False
-    check = _checked(found, ["total_mass"], masses[None] / (masses @ found.standard), np.zeros(1))
+    check = _checked(fit, ["total_mass"], masses[None] / (masses @ fit.standard), np.zeros(1))
     return check.ratio is not None and check.half_width <= AGREES
 
 
-def _are_masses(found: Fit) -> Array:
+def _are_masses(fit: Fit) -> Array:
     """Return which standard parameters are masses, shape (p,), bool."""
-    return np.array([name.endswith(".m") for name in found.model.layout.names])
+    return np.array([name.endswith(".m") for name in fit.model.layout.names])
 
 
-def _checked(found: Fit, names: Sequence[str], C: Array, widths: Array) -> StatedMass:
+def _checked(fit: Fit, names: Sequence[str], C: Array, widths: Array) -> StatedMass:
     """Return what torque alone determines of the ratio r in C pi = r 1.
 
     Torque alone determines K pi = beta. Sums Z^T C of the claims that are sums M K of base
     parameters have no free part; with o = Z^T 1, r = o . M beta / o . o. In units of the spread.
     """
-    model, wls = found.model, found.wls
-    is_pinned = model.layout.owned_by(found.estimator.bounds.pinned)
-    spread = np.where(found.prior_std > 0, found.prior_std, model.layout.scales(model.length))
+    model, wls = fit.model, fit.wls
+    is_pinned = model.layout.owned_by(fit.estimator.bounds.pinned)
+    spread = np.where(fit.prior_std > 0, fit.prior_std, model.layout.scales(model.length))
     spread = np.where(is_pinned, 0.0, spread)  # a stated mass is not known here
     is_known = np.isfinite(np.diag(wls.covariance))
-    K = found.mapping.K[is_known]
+    K = fit.mapping.K[is_known]
     inverse = np.linalg.pinv(K * spread)  # (p, b)
     claims = C * spread  # (k, p)
     free = claims - claims @ inverse @ (K * spread)  # (k, p), changes no torque
@@ -499,7 +498,7 @@ def _checked(found: Fit, names: Sequence[str], C: Array, widths: Array) -> State
         return StatedMass(tuple(names), absorbed_by=tuple(links))
     sums = Z @ o / (o @ o)  # (k,), of the claims
     M = sums @ claims @ inverse  # (b,)
-    pinned = np.where(is_pinned, found.prior, 0.0)
+    pinned = np.where(is_pinned, fit.prior, 0.0)
     ratio = float(M @ (wls.theta[is_known] - K @ pinned) + sums @ C @ pinned)
     error = float(np.sqrt(max(M @ wls.covariance[np.ix_(is_known, is_known)] @ M, 0.0)))
     width = QUANTILE * error + float(np.abs(sums) @ widths)

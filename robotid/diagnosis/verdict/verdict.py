@@ -94,9 +94,9 @@ class Predictions:
 
     def _evaluated(self, metrics: Metrics) -> dict[str, JointMetrics]:
         """Return the metrics of joints; those of a floating base if no joint has any."""
-        found = {joint: m for joint, m in metrics.per_joint.items() if joint not in self.hidden}
-        joints = {name: m for name, m in found.items() if not name.startswith(_BASE)}
-        return joints or found
+        rows = {row: m for row, m in metrics.per_joint.items() if row not in self.hidden}
+        joints = {row: m for row, m in rows.items() if not row.startswith(_BASE)}
+        return joints or rows
 
     def of_base(self) -> list[str]:
         """Return the prediction errors of the wrench on a floating base, beside its joints'."""
@@ -327,7 +327,7 @@ def _predicted(joints: Mapping[str, str]) -> str:
 
 def _named(joints: Mapping[str, str], status: str) -> str:
     """Return the joints with a status, as part of a sentence."""
-    return listed([joint for joint, found in joints.items() if found == status], NAMED)
+    return listed([joint for joint, verdict in joints.items() if verdict == status], NAMED)
 
 
 def _with(use: str, condition: str) -> str:
@@ -389,12 +389,12 @@ def judge(
     cause_of: Callable[[str], tuple[str, str]] | None = None,
 ) -> Verdict:
     """Return the verdict on a result."""
-    found, hidden = predictions.on_each(), predictions.hidden
-    costly = [w for w in warnings if w.effect == "poor" and w.joint in found]
+    evidence, hidden = predictions.on_each(), predictions.hidden
+    costly = [w for w in warnings if w.effect == "poor" and w.joint in evidence]
     for warning in costly:
-        found[warning.joint].poor.extend((2, text) for text in _described([warning]))
+        evidence[warning.joint].poor.extend((2, text) for text in _described([warning]))
     stated, warnings = warnings, [warning for warning in warnings if warning not in costly]
-    largest = sorted(found.values(), key=lambda one: -max(one.errors, default=0.0))
+    largest = sorted(evidence.values(), key=lambda one: -max(one.errors, default=0.0))
     poor = _ranked(reason for one in largest for reason in one.poor)
     is_contradicted = scale_check is not None and scale_check.contradicts
     scale = [] if scale_check is None else [scale_check.message]
@@ -425,12 +425,12 @@ def judge(
             if one.errors
             else predictions.why_untested(joint),
         )
-        for joint, one in found.items()
+        for joint, one in evidence.items()
     }
     per_joint |= {joint: JointVerdict("not evaluated", (_HIDDEN,)) for joint in hidden}
     if cause_of is not None:
-        notes = [*_largest_error(per_joint, found, cause_of), *notes]
-    worst = max((error for one in found.values() for error in one.errors), default=0.0)
+        notes = [*_largest_error(per_joint, evidence, cause_of), *notes]
+    worst = max((error for one in evidence.values() for error in one.errors), default=0.0)
     good = (
         f"torque prediction error on {logs_that_test(predictions.validation)}: at most "
         f"{worst:.1f} % at every joint, smaller than that of a constant and that of the URDF; all "
@@ -440,7 +440,7 @@ def judge(
         per_joint, poor=poor, warnings=reasons, good=good, notes=notes, log_errors=log_errors
     )
     uses = uses_of_torques(
-        {joint: per_joint[joint].status for joint in found},
+        {joint: per_joint[joint].status for joint in evidence},
         is_consistent=determined.is_consistent,
         is_static=determined.is_static,
         log_errors=log_errors,
@@ -456,14 +456,14 @@ def _ranked(reasons: Iterable[tuple[int, str]]) -> list[str]:
 
 def _largest_error(
     per_joint: dict[str, JointVerdict],
-    found: Mapping[str, JointEvidence],
+    evidence: Mapping[str, JointEvidence],
     cause_of: Callable[[str], tuple[str, str]],
 ) -> list[str]:
     """Add the cause to the good joint with the largest error; return it if all joints are good."""
     good = [joint for joint, verdict in per_joint.items() if verdict.status == "good"]
     if not good:
         return []
-    last = max(good, key=lambda joint: max(found[joint].errors))
+    last = max(good, key=lambda joint: max(evidence[joint].errors))
     cause, advice = cause_of(last)
     text = f"largest error of the good joints: {'. '.join(filter(None, (cause, advice)))}"
     per_joint[last] = replace(per_joint[last], reasons=(*per_joint[last].reasons, text))

@@ -339,10 +339,7 @@ def cos_sin(angle):
 
 @compiled
 def factor(work, n, H):
-    """Write the lower Cholesky factor of the symmetric positive definite H, in place.
-
-    Its diagonal is written as the reciprocals, by which ``solve`` multiplies.
-    """
+    """Write the Cholesky factor of H in place, its diagonal as reciprocals for ``solve``."""
     for j in range(n):
         for i in range(j, n):
             x = get(work, H + i * n + j)

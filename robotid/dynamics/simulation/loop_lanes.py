@@ -1,4 +1,4 @@
-"""Closed-loop simulation of a robot with sensitivities, in Numba.
+"""Closed-loop simulation of a robot with sensitivities, in Numba: the steps and the drives' laws.
 
 Imported only for closed-loop simulations. ``LANES`` windows of logs are simulated together, one in
 each lane of the work space of ``tree_lanes``, each from the initial state of its window.
@@ -22,25 +22,37 @@ u, its equation is linear and solved exactly. The torque is that of z at t + the
 A discrete-time controller samples q, v and its commands at its ticks, and has a zero-order hold of
 the torque. No step crosses a tick. The held torque has its own sensitivities, which change only at
 ticks.
+
+Friction has the laws of the terms of ``drives``, compiled one by one; the code here calls a law by
+its address. ``drive`` has armature, kp, kd and torque limit.
 """
 
+import math
+from functools import cache
 from typing import NamedTuple
 
+import numpy as np
+
+from robotid.base.exceptions import SettingsError
 from robotid.base.typing import Array
 from robotid.dynamics.compiled import Tree
 from robotid.dynamics.kernels.lanes import (
     LANES,
+    applied,
     compiled,
     copysign,
     factor,
     get,
     is_any,
+    lane_of,
+    pointed,
     put,
     put3,
     read,
     solve,
     where,
     wide,
+    with_lane,
     work_space,
     write,
 )
@@ -53,40 +65,30 @@ from robotid.dynamics.kernels.tree_lanes import (
     mass_matrix,
     place,
 )
-from robotid.dynamics.simulation.law_lanes import (
-    ARMATURE,
-    INERTIAL,
-    SPEED,
-    START,
-    TERM,
-    ZERO,
-    affine_term,
-    by_delay,
-    by_loop,
-    deflection_by_lane,
-    direction,
-    initial_deflection_by_lane,
-    loop_torque,
-    read_command,
-    term_by_lane,
-)
-from robotid.robot.drive_term import BRISTLES, LOADED
+from robotid.robot.drive_term import BRISTLES, LOADED, PLAIN, DriveTerm, Law, MemorylessTerm
+from robotid.robot.drives import Bristles
 
 THETA = 0.5  # instant of the forces, relative to the step: exact to second order
 _NEWTON = 60  # largest number of steps; three or four are typical
 _CLOSE = 1e-12  # of the speed, relative to 1 + its size
 _MOVED_BEFORE = 0.1  # assumed time of motion before the simulation, for initial deflections [s]
+_SIGN = 1e-5  # speed over which friction reverses [rad/s or m/s]
+
+# kinds of sensitivities
+ARMATURE, KP, KD, LIMIT, TERM, DELAY, ZERO, INERTIAL, START, SPEED = range(10)
+
+_bristles = compiled(Bristles.law)
+_pointed = cache(pointed)
 
 
 class Terms(NamedTuple):
     """Friction and offset of the joints: T terms, joint by joint."""
 
     codes: Array  # codes of ``coded_term``, shape (T, 5), int; the third is the kind of the term
-    shapes: Array  # shape parameters of laws, or of bristles with their index, shape (T, 11)
+    shapes: Array  # shape parameters of laws or bristles, shape (T, 11)
     values: Array  # parameters, shape (T,)
-    # indices of each joint's first term, of its first term that is a bristle term or part of
-    # the drives' sums, and of the end, shape (n, 3), int
-    spans: Array
+    spans: Array  # index of each joint's first term, and first bristle or affine term, (n, 2), int
+    bristles: Array  # index of each bristle term, and its joint, shape (B, 2), int
 
 
 class Robot(NamedTuple):
@@ -95,8 +97,7 @@ class Robot(NamedTuple):
     tree: Tree  # its bodies and joints
     zeros: Array  # position of the URDF at position 0 of each encoder, shape (n,) [rad or m]
     bodies: Array  # inertial parameters, shape (n, 10)
-    # armature, kp, kd, torque limit, and the sums of affine terms: constant, by the speed,
-    # and by its direction, shape (n, 7)
+    # armature, kp, kd, torque limit; sums of affine terms: 1, speed, its direction; shape (n, 7)
     drives: Array
     terms: Terms  # friction and offset
 
@@ -105,9 +106,7 @@ class Columns(NamedTuple):
     """Parameters of the sensitivities."""
 
     kinds: Array  # kind, joint and index of each column, shape (C, 3), int
-    # index of the first column of each of the P sensitivities, each the sum of its columns,
-    # and the number of columns, shape (P + 1,), int
-    sums: Array
+    sums: Array  # first column of each of the P sums that are sensitivities, and end, (P + 1,), int
     directions: Array  # directions in a body's ten parameters, shape (D, 10)
 
 
@@ -118,9 +117,7 @@ class Course(NamedTuple):
     # torque by the delay: means over each step, or values of its tick, shape (K, n, 6, LANES)
     command: Array
     steps: Array  # length of each step, shape (K, LANES) [s]
-    # 1 where the controller has a tick at the start of a step, else 0, shape (K, LANES); 1 at
-    # the first; empty in continuous time
-    ticks: Array
+    ticks: Array  # 1 at steps that start with a tick, as the first; (K, LANES); else empty
     every: int  # number of steps from one sample to the next
     start: Array  # initial positions and speeds, shape (2, n, LANES)
 
@@ -130,9 +127,7 @@ class Motion(NamedTuple):
 
     q: Array  # positions, shape (N, n, LANES)
     v: Array  # speeds, shape (N, n, LANES)
-    # sensitivities of positions, shape (N, n, P, LANES), or of positions and then of speeds,
-    # shape (N, 2n, P, LANES)
-    S: Array
+    S: Array  # sensitivities of positions, (N, n, P, LANES), or also of speeds, (N, 2n, P, LANES)
 
 
 class Places(NamedTuple):
@@ -155,7 +150,7 @@ class Places(NamedTuple):
     loss: int  # factor of the load in a gear with friction
     held: int  # torque until the next tick; -1 in continuous time
     grip: int  # friction of bristles, then its derivative by the speed
-    bristles: int  # of each: z, the acting z, and three derivatives; -1 without any
+    bristles: int  # of each: z, the acting z, and three derivatives
     T_q: int  # derivative of the equation by positions before the step, (n, n)
     T_v: int  # and by speeds, (n, n)
     S: int  # sensitivities of positions and speeds, (2n, P)
@@ -176,7 +171,7 @@ def _places(n, P, n_bristles, is_held):
     return Places(
         n, P, q, q + n, q + 2 * n, q + 3 * n, q + 4 * n, q + 5 * n,
         M, q + 6 * n, M + n * n, q + 7 * n, q + 8 * n, q + 11 * n, q + 12 * n,
-        held if is_held else -1, grip, bristles if n_bristles else -1,
+        held if is_held else -1, grip, bristles,
         M + 2 * n * n, M + 3 * n * n, S, q + 9 * n, q + 10 * n,
         S + 2 * n * P, bristles + 5 * n_bristles,
     )  # fmt: skip
@@ -203,9 +198,8 @@ def _balance(work, at, robot, step, now):
     with friction mu |tau|, so that H is symmetric.
     """
     n, drives, terms = at.n, robot.drives, robot.terms
-    codes, shapes, values, spans = terms
-    if at.bristles >= 0:
-        _presliding(work, at, terms, THETA * step)
+    codes, shapes, values, spans, _ = terms
+    _presliding(work, at, terms, THETA * step)
     rate = 1.0 / (THETA * step)
     for i in range(n):
         tau = get(work, at.h + i)
@@ -266,7 +260,7 @@ def _solve(work, at, robot, step, now):
 @compiled
 def _add_fall(work, at, terms):
     """Add to H the slopes of friction that falls with speed, so that it is positive definite."""
-    codes, shapes, values, spans = terms
+    codes, shapes, values, spans, _ = terms
     for i in range(at.n):
         for k in range(spans[i, 0], spans[i, 1]):
             if codes[k, 2] == LOADED:
@@ -350,17 +344,14 @@ def _hold(work, at, columns, drives, now, is_tick):
 @compiled
 def _presliding(work, at, terms, span):
     """Write the presliding friction after a time at the speeds u, and its derivative."""
-    codes, shapes, values, spans = terms
-    for i in range(at.n):
-        speed, f, f_u = get(work, at.u + i), wide(0.0), wide(0.0)
-        for k in range(spans[i, 0], spans[i, 2]):
-            if codes[k, 2] == BRISTLES:
-                before = get(work, at.bristles + 5 * int(shapes[k, 3]))
-                z, z_u, _ = deflection_by_lane(shapes[k], before, speed, span)
-                f += values[k] * z
-                f_u += values[k] * z_u
-        put(work, at.grip + i, f)
-        put(work, at.grip + at.n + i, f_u)
+    for i in range(2 * at.n):
+        put(work, at.grip + i, 0.0)
+    for slot in range(len(terms.bristles)):
+        k, i = terms.bristles[slot, 0], terms.bristles[slot, 1]
+        before, grip = get(work, at.bristles + 5 * slot), at.grip + i
+        z, z_u, _ = deflection_by_lane(terms.shapes[k], before, get(work, at.u + i), span)
+        put(work, grip, get(work, grip) + terms.values[k] * z)
+        put(work, grip + at.n, get(work, grip + at.n) + terms.values[k] * z_u)
 
 
 @compiled
@@ -369,56 +360,43 @@ def _advance_bristles(work, at, terms, span, step):
 
     The derivatives are: of the acting z by z before; of z after by the speed u, and by z before.
     """
-    codes, shapes, _, spans = terms
-    for i in range(at.n):
-        for k in range(spans[i, 0], spans[i, 2]):
-            if codes[k, 2] == BRISTLES:
-                z = at.bristles + 5 * int(shapes[k, 3])
-                speed, before = get(work, at.u + i), get(work, z)
-                acts, _, share = deflection_by_lane(shapes[k], before, speed, span)
-                after, by_speed, by_before = deflection_by_lane(shapes[k], before, speed, step)
-                put(work, z, after)
-                put(work, z + 1, acts)
-                put3(work, z + 2, (share, by_speed, by_before))
+    for slot in range(len(terms.bristles)):
+        x, speed = terms.shapes[terms.bristles[slot, 0]], get(work, at.u + terms.bristles[slot, 1])
+        z = at.bristles + 5 * slot
+        before = get(work, z)
+        acts, _, share = deflection_by_lane(x, before, speed, span)
+        after, by_speed, by_before = deflection_by_lane(x, before, speed, step)
+        put(work, z, after)
+        put(work, z + 1, acts)
+        put3(work, z + 2, (share, by_speed, by_before))
 
 
 @compiled
 def _initialise_bristles(work, at, columns, terms):
-    """Write the initial z and its derivative by the initial speed v.
-
-    It is that of steady sliding, unless the joint needs more than ``_MOVED_BEFORE`` for it.
-    """
-    codes, shapes, _, spans = terms
+    """Write the initial z of ``initial_deflection`` and its derivative by the initial speed v."""
     kinds, sums, P = columns.kinds, columns.sums, at.P
-    for i in range(at.n):
-        for k in range(spans[i, 0], spans[i, 2]):
-            if codes[k, 2] != BRISTLES:
-                continue
-            slot, v = int(shapes[k, 3]), get(work, at.v + i)
-            z, z_v = initial_deflection_by_lane(shapes[k], v, _MOVED_BEFORE)
-            put(work, at.bristles + 5 * slot, z)
-            for p in range(P):
-                if kinds[sums[p], 0] == SPEED and kinds[sums[p], 1] == i:
-                    put(work, at.by_state + slot * P + p, z_v)
+    for slot in range(len(terms.bristles)):
+        x, i = terms.shapes[terms.bristles[slot, 0]], terms.bristles[slot, 1]
+        z, z_v = initial_deflection_by_lane(x, get(work, at.v + i), _MOVED_BEFORE)
+        put(work, at.bristles + 5 * slot, z)
+        for p in range(P):
+            if kinds[sums[p], 0] == SPEED and kinds[sums[p], 1] == i:
+                put(work, at.by_state + slot * P + p, z_v)
 
 
 @compiled
 def _bristle_column(work, at, terms, p, is_after):
     """Add the effect of bristle states to one column; after the step, advance their columns."""
-    codes, shapes, values, spans = terms
-    for i in range(at.n):
-        for k in range(spans[i, 0], spans[i, 2]):
-            if codes[k, 2] != BRISTLES:
-                continue
-            slot = int(shapes[k, 3])
-            z, Z = at.bristles + 5 * slot, at.by_state + slot * at.P + p
-            x = get(work, Z)
-            if is_after:
-                x *= get(work, z + 4)
-                put(work, Z, x + get(work, z + 3) * get(work, at.change + i))
-            else:
-                x *= values[k] * get(work, z + 2) / get(work, at.loss + i)
-                put(work, at.own + i, get(work, at.own + i) + x)
+    for slot in range(len(terms.bristles)):
+        k, i = terms.bristles[slot, 0], terms.bristles[slot, 1]
+        z, Z = at.bristles + 5 * slot, at.by_state + slot * at.P + p
+        x = get(work, Z)
+        if is_after:
+            x *= get(work, z + 4)
+            put(work, Z, x + get(work, z + 3) * get(work, at.change + i))
+        else:
+            x *= terms.values[k] * get(work, z + 2) / get(work, at.loss + i)
+            put(work, at.own + i, get(work, at.own + i) + x)
 
 
 @compiled
@@ -447,23 +425,23 @@ def _propagate(work, at, robot, columns, step, now):
             for i in range(n):
                 x = get(work, at.by_hold + i * P + p) / get(work, at.loss + i)
                 put(work, own + i, get(work, own + i) - x)
-        if at.bristles >= 0:
-            _bristle_column(work, at, robot.terms, p, False)
+        _bristle_column(work, at, robot.terms, p, False)
         _advance_column(work, at, step, p)
-        if at.bristles >= 0:
-            _bristle_column(work, at, robot.terms, p, True)
+        _bristle_column(work, at, robot.terms, p, True)
 
 
 @compiled
 def _drive_column(work, at, robot, step, now, column):
     """Add the derivative of a step's equation by a parameter of a drive."""
-    drives, (codes, shapes, _, spans) = robot.drives, robot.terms
+    drives, (codes, shapes, _, spans, bristles) = robot.drives, robot.terms
     kind, j, index = column
     span, speed, x = THETA * step, get(work, at.u + j), wide(0.0)
     if kind == ARMATURE:
         x = (speed - get(work, at.v + j)) / span
     elif kind == TERM and codes[index, 2] == BRISTLES:
-        x = get(work, at.bristles + 5 * int(shapes[index, 3]) + 1)
+        for slot in range(len(bristles)):
+            if bristles[slot, 0] == index:
+                x = get(work, at.bristles + 5 * slot + 1)
     elif kind == TERM and index >= spans[j, 1]:
         x = affine_term(codes, index, speed)
     elif kind == TERM:
@@ -536,8 +514,7 @@ def _initialise(work, at, robot, columns, start, out_S):
             put(work, at.S + row * P + p, 1.0)
             if row < out_S.shape[1]:
                 out_S[0, row, p] = 1.0
-    if at.bristles >= 0:
-        _initialise_bristles(work, at, columns, robot.terms)
+    _initialise_bristles(work, at, columns, robot.terms)
 
 
 @compiled
@@ -548,7 +525,7 @@ def roll_out(robot, columns, course, out, work, corrects):
     out_S, rows = out.S.reshape(out.S.size), out.S.shape[1]
     tree, bodies, terms = robot.tree, robot.bodies, robot.terms
     n, P = len(tree.parents), len(columns.sums) - 1
-    at = _places(n, P, (terms.codes[:, 2] == BRISTLES).sum(), len(ticks) > 0)
+    at = _places(n, P, len(terms.bristles), len(ticks) > 0)
     work[:] = 0.0
     _initialise(work, at, robot, columns, start, out.S)
     commands, starts = command.reshape(command.size), ticks.reshape(ticks.size)
@@ -566,8 +543,7 @@ def roll_out(robot, columns, course, out, work, corrects):
             _centre(work, at, robot, step, at.u)
             if not _solve(work, at, robot, step, now):
                 return k
-        if at.bristles >= 0:
-            _advance_bristles(work, at, terms, THETA * step, step)
+        _advance_bristles(work, at, terms, THETA * step, step)
         if P:
             for i in range(n):
                 moved = get(work, at.u + i) - get(work, at.v + i)
@@ -584,3 +560,224 @@ def roll_out(robot, columns, course, out, work, corrects):
             for row in range(rows * P):
                 write(out_S, (sample * rows * P + row) * LANES, get(work, at.S + row))
     return -1
+
+
+# --- laws of drives: friction, control and averaged commands -------------------------------------
+
+
+def coded_term(term: DriveTerm) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    """Return a term for ``term`` and ``deflection``: five codes and eleven numbers.
+
+    The codes are the addresses of its laws of speed and position (0 without one), its kind, and the
+    number of shape parameters of each law. The numbers are four shape parameters of each law, and
+    the ranges.
+    """
+    if isinstance(term, Bristles):
+        return (0, 0, BRISTLES, 0, 0), (*term.numbers, *[0.0] * 8)
+    if isinstance(term, MemorylessTerm):
+        a, b = term.speed_shape, term.position_shape
+        laws = _address(term.speed_law, len(a)), _address(term.position_law, len(b))
+        shapes = *a, *[0.0] * (4 - len(a)), *b, *[0.0] * (4 - len(b))
+        return (*laws, term.kind, len(a), len(b)), (*shapes, *term.ranges)
+    raise SettingsError(
+        f"the term {type(term).__name__} is not possible in a closed-loop simulation: it delays "
+        "the measured torque, whereas the simulation delays the commands. Leave the term out, and "
+        "set delay in [controller] or leave delay out, so that it is fitted"
+    )
+
+
+def _address(law: Law | None, shapes: int) -> int:
+    return 0 if law is None else int(_pointed(law, 1 + shapes).address)
+
+
+@compiled
+def _law(address, shapes, z, x0, x1, x2, x3):
+    """Return the value of a law of a speed or position with its shape parameters, and its slope."""
+    if shapes == 0:
+        return applied(address, (z,))
+    if shapes == 1:
+        return applied(address, (z, x0))
+    if shapes == 2:
+        return applied(address, (z, x0, x1))
+    if shapes == 3:
+        return applied(address, (z, x0, x1, x2))
+    return applied(address, (z, x0, x1, x2, x3))
+
+
+@compiled
+def term(codes, shapes, k, q, u, s, s_u):
+    """Return the regressor of a term but its load, and its derivatives by speed and position."""
+    by_speed, by_position, kind = codes[k, 0], codes[k, 1], codes[k, 2]
+    x, a, a_u, b, b_q = shapes[k], 1.0, 0.0, 1.0, 0.0
+    if by_speed:
+        w = min(max(u, -x[8]), x[8])  # constant outside the range of the data
+        a, a_u = _law(by_speed, codes[k, 3], w, x[0], x[1], x[2], x[3])
+        a_u = a_u if w == u else 0.0
+    if by_position:
+        p = min(max(q, x[9]), x[10])
+        b, b_q = _law(by_position, codes[k, 4], p, x[4], x[5], x[6], x[7])
+        b_q = b_q if p == q else 0.0
+    if kind == PLAIN:
+        return a * b, a_u * b, a * b_q
+    return s * a * b, (s_u * a + s * a_u) * b, s * a * b_q
+
+
+@compiled
+def term_by_lane(codes, shapes, k, q, u, s, s_u):
+    """Return ``term`` of vectors."""
+    y, y_u, y_q = wide(0.0), wide(0.0), wide(0.0)
+    for lane in range(LANES):
+        x, x_u, x_q = term(
+            codes, shapes, k,
+            lane_of(q, lane), lane_of(u, lane), lane_of(s, lane), lane_of(s_u, lane),
+        )  # fmt: skip
+        y, y_u, y_q = with_lane(y, lane, x), with_lane(y_u, lane, x_u), with_lane(y_q, lane, x_q)
+    return y, y_u, y_q
+
+
+@compiled
+def affine_term(codes, k, u):
+    """Return the regressor of an affine term: the speed, its direction, or 1."""
+    if codes[k, 0]:
+        return 1.0 * u
+    return wide(1.0) if codes[k, 2] == PLAIN else direction(u)[0]
+
+
+@compiled
+def direction(u, over=_SIGN):
+    """Return the direction of friction, which reverses over a small speed, and its derivative."""
+    root = math.sqrt(u * u + over * over)
+    return u / root, over * over / (root * root * root)
+
+
+@compiled
+def deflection(x, before, u, span):
+    """Return the deflection z after a time at speed u, and its derivatives by u and z before."""
+    g, g_u, decay = _bristles(x, span * u, u)
+    s = 1.0 if u > 0.0 or (u == 0.0 and before < 0.0) else -1.0  # at rest: the stiffer side
+    decay_u = -decay * s * span / (x[0] * g) * (1.0 - u * g_u / g)
+    z_u = s * g_u * (1.0 - decay) + (before - s * g) * decay_u
+    return s * g + (before - s * g) * decay, z_u, decay
+
+
+@compiled
+def deflection_by_lane(x, before, u, span):
+    """Return ``deflection`` of vectors."""
+    z, z_u, decay = wide(0.0), wide(0.0), wide(0.0)
+    for lane in range(LANES):
+        y, y_u, left = deflection(x, lane_of(before, lane), lane_of(u, lane), lane_of(span, lane))
+        z, z_u = with_lane(z, lane, y), with_lane(z_u, lane, y_u)
+        decay = with_lane(decay, lane, left)
+    return z, z_u, decay
+
+
+@compiled
+def initial_deflection(x, v, time):
+    """Return the deflection z of a drive that has moved for a time, and its derivative by speed.
+
+    It is that of steady sliding, unless the drive needs more time for its displacement.
+    """
+    g, g_v, _ = _bristles(x, 0.0, v)
+    s, s_v = direction(v, x[0] / time)
+    return s * g, s_v * g + s * g_v
+
+
+@compiled
+def initial_deflection_by_lane(x, v, time):
+    """Return ``initial_deflection`` of vectors."""
+    z, z_v = wide(0.0), wide(0.0)
+    for lane in range(LANES):
+        y, y_v = initial_deflection(x, lane_of(v, lane), time)
+        z, z_v = with_lane(z, lane, y), with_lane(z_v, lane, y_v)
+    return z, z_v
+
+
+@compiled
+def loop_torque(drive, error, speed_error, forward):
+    """Return the torque that a loop commands, and 1 below its limit, else 0."""
+    unlimited, limit = drive[1] * error + drive[2] * speed_error + forward, drive[3]
+    is_free = abs(unlimited) < limit
+    return where(is_free, unlimited, copysign(limit, unlimited)), where(is_free, 1.0, 0.0)
+
+
+@compiled
+def read_command(now, i, kind):
+    """Return an input of joint i over a step; ``now`` has all inputs and the step's first."""
+    inputs, first = now
+    return read(inputs, (first + 6 * i + kind) * LANES)
+
+
+@compiled
+def by_delay(drive, now, i):
+    """Return the derivative of a loop's torque by the delay of its commands, below its limit."""
+    by_position = drive[1] * read_command(now, i, 1)
+    return by_position + drive[2] * read_command(now, i, 4) + read_command(now, i, 5)
+
+
+@compiled
+def by_loop(kind, is_on, error, speed_error, by_delay, torque):
+    """Return the derivative of a loop's torque by a gain, its delay or its limit."""
+    if kind == KP:
+        return is_on * error
+    if kind == KD:
+        return is_on * speed_error
+    if kind == DELAY:
+        return is_on * by_delay
+    return (1.0 - is_on) * copysign(1.0, torque) if kind == LIMIT else wide(0.0)
+
+
+@compiled
+def average_command(stamps, values, times, delay, mean, change):
+    """Write the mean command over each step, (K,), and its derivative by the delay."""
+    last, i = len(stamps) - 1, 0
+    start = times[0] - delay
+    while i < last and stamps[i + 1] <= start:
+        i += 1
+    for k in range(len(mean)):
+        end, before, at, total = times[k + 1] - delay, values[i], start, 0.0
+        while i < last and stamps[i + 1] <= end:
+            total += values[i] * (stamps[i + 1] - at) if stamps[i + 1] > at else 0.0
+            at = max(at, stamps[i + 1])
+            i += 1
+        total += values[i] * (end - at)
+        mean[k] = total / (end - start)
+        change[k] = (before - values[i]) / (end - start)
+        start = end
+
+
+@compiled
+def divide_rows(stamps, ticks, times, is_tick):
+    """Write the ends of the steps: an equal number in each row, and none across a tick.
+
+    Ticks divide a row. The longest steps are divided further, into two, three and so on, until the
+    row has the required number.
+    stamps (N,) [s], is_tick ((N - 1) every,).
+    """
+    every, i = len(is_tick) // (len(stamps) - 1), 0
+    edges, shares = np.empty(every + 1), np.empty(every, np.int64)
+    is_tick[:], is_tick[0] = False, True
+    for k in range(len(stamps) - 1):
+        edges[0], count = stamps[k], 1
+        while i < len(ticks) and ticks[i] < stamps[k + 1]:
+            if ticks[i] > stamps[k]:
+                edges[count] = ticks[i]
+                count += 1
+            else:
+                is_tick[k * every] = True
+            i += 1
+        edges[count] = stamps[k + 1]
+        shares[:count] = 1
+        for _ in range(every - count):
+            longest, length = 0, 0.0  # np.argmax and np.diff take three seconds to compile
+            for j in range(count):
+                step = (edges[j + 1] - edges[j]) / shares[j]
+                if step > length:
+                    longest, length = j, step
+            shares[longest] += 1
+        at = k * every
+        for j in range(count):
+            is_tick[at] = is_tick[at] or j > 0
+            for part in range(shares[j]):
+                times[at] = edges[j] + (edges[j + 1] - edges[j]) * part / shares[j]
+                at += 1
+    times[-1] = stamps[-1]

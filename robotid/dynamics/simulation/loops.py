@@ -29,7 +29,7 @@ from robotid.robot.model import RobotModel
 if TYPE_CHECKING:
     from robotid.dynamics.simulation.loop_lanes import Course
 
-#: Kind, joint and index of a parameter of the sensitivities; see ``law_lanes``.
+#: Kind, joint and index of a parameter of the sensitivities; see ``loop_lanes``.
 Column: TypeAlias = tuple[int, int, int]
 
 _KINDS = ("armature", "kp", "kd", "limit", "term", "delay", "zero", "body", "start", "speed")
@@ -71,20 +71,18 @@ class Loops:
 def open_loops(model: RobotModel, pi: Array) -> Loops:
     """Return bodies and drives of standard parameters without control: no gain, no delay."""
     layout, n = model.layout, len(model.joints)
-    terms: list[list[DriveTerm]] = [[] for _ in range(n)]
-    values: list[list[float]] = [[] for _ in range(n)]
     armature, none = np.zeros(n), np.zeros(n)
-    drives = zip(layout.drive_parameters, pi[layout.n_inertial :].tolist(), strict=True)
-    for (d, term), value in drives:
+    drives: list[list[tuple[DriveTerm, float]]] = [[] for _ in range(n)]
+    for (d, term), value in zip(layout.drive_parameters, pi[layout.n_inertial :], strict=True):
         if term.is_inertia:
             armature[d] = value
         else:
-            terms[d].append(term)
-            values[d].append(value)
+            drives[d].append((term, value))
     return Loops(
         bodies=pi[: layout.n_inertial].reshape(-1, 10), armature=armature, kp=none, kd=none,
-        limit=np.full(n, np.inf), delay=none, zero=none, terms=tuple(map(tuple, terms)),
-        values=np.concatenate([np.zeros(0), *values]),
+        limit=np.full(n, np.inf), delay=none, zero=none,
+        terms=tuple(tuple(term for term, _ in drive) for drive in drives),
+        values=np.array([value for drive in drives for _, value in drive]),
     )  # fmt: skip
 
 
@@ -96,8 +94,7 @@ class Window:
     start_row: int  # first simulated sample
     first: int  # first counted sample; before it, the error of the initial state decays
     stop: int  # sample after the last one
-    # initial position and speed, shape (2, n); the measured ones if None
-    given: Array | None = None
+    given: Array | None = None  # initial position and speed, (2, n); None: the measured ones
 
     @property
     def counted(self) -> slice:
@@ -107,8 +104,7 @@ class Window:
     @property
     def around(self) -> Array:
         """Mean position about the first sample, shape (n,): that of a joint at rest."""
-        mean: Array = self.log.q[self._near].mean(axis=0)
-        return mean
+        return np.asarray(self.log.q[self._near].mean(axis=0))
 
     @property
     def _near(self) -> slice:
@@ -127,8 +123,8 @@ class Window:
         if self.given is not None:
             return self.given
         t, q, k, near = self.log.t, self.log.q, self.start_row, self._near
-        along, order = t[near] - t[k], min(2, len(t[near]) - 1)
-        fit = np.polynomial.polynomial.polyfit(along, q[near], order)
+        order = min(2, len(t[near]) - 1)
+        fit = np.polynomial.polynomial.polyfit(t[near] - t[k], q[near], order)
         return np.stack([q[k], fit[1]])
 
 
@@ -160,9 +156,8 @@ class RollOut:
     window: Window  # the window
     q: Array  # positions of the counted samples, shape (N, n) [rad or m]
     v: Array  # speeds of the counted samples, shape (N, n) [rad/s or m/s]
-    # for each part of the robot: its joints, shape (k,); the indices of its sensitivities,
-    # ascending, shape (c,); and the derivatives of its positions, shape (N, k, c), or of its
-    # positions and speeds, shape (N, 2k, c)
+    # of each part: its joints (k,), indices of its sensitivities (c,), and derivatives of its
+    # positions (N, k, c), or of its positions and speeds (N, 2k, c)
     slopes: tuple[tuple[Array, Array, Array], ...] = ()
 
 
@@ -177,7 +172,7 @@ class _Part(NamedTuple):
 class ClosedLoopRobot:
     """Simulator of a robot with closed-loop drives."""
 
-    #: Numbers of the kinds of sensitivities, by name, as of ``law_lanes``.
+    #: Numbers of the kinds of sensitivities, by name, as of ``loop_lanes``.
     kinds: ClassVar[dict[str, int]] = {name: k for k, name in enumerate(_KINDS)}
 
     def __init__(self, model: RobotModel, *, step: float = 2e-3, corrects: bool = False) -> None:
@@ -214,15 +209,12 @@ class ClosedLoopRobot:
         owners: Sequence[int] | None = None,
         with_speeds: bool = False,
     ) -> list[RollOut]:
-        """Return the simulated motion of windows: directions (D, 10).
-
-        Columns with one owner are added to one sensitivity, that of their owner.
-        """
+        """Return the simulated motion of windows; columns with one owner are added together."""
         kinds = np.array(columns, dtype=np.int64).reshape(-1, 3)
         numbers = np.arange(len(kinds)) if owners is None else np.array(owners, dtype=np.int64)
         wanted = np.column_stack([kinds, numbers])[np.argsort(numbers, kind="stable")]
         along = np.zeros((0, 10)) if directions is None else np.array(directions, order="C")
-        size, outputs = _lanes()[0].LANES, 2 if with_speeds else 1
+        size, outputs = _lanes().LANES, 2 if with_speeds else 1
         blocks = [windows[k : k + size] for k in range(0, len(windows), size)]
         pieces = [(part, block) for block in blocks for part in self._parts]
         done = in_order(lambda p: self._block(p[0], p[1], loops, wanted, along, outputs), pieces)
@@ -253,7 +245,7 @@ class ClosedLoopRobot:
 
         ``wanted`` has a row for each column: kind, joint, index, and index of the sensitivity.
         """
-        (lanes, laws), own, n = _lanes(), part.joints, len(part.joints)
+        lanes, own, n = _lanes(), part.joints, len(part.joints)
         columns = wanted[np.isin(wanted[:, 1], own)]
         numbers, first = np.unique(columns[:, 3], return_index=True)
         sums = np.append(first, len(columns)).astype(np.int64)
@@ -262,13 +254,14 @@ class ClosedLoopRobot:
         places, spans, affine = _arranged(loops, own)
         is_term = columns[:, 0] == self.kinds["term"]
         columns[is_term, 2] = [np.flatnonzero(places == k)[0] for k in columns[is_term, 2]]
-        every_term = [term for terms in loops.terms for term in terms]
-        coded = [laws.coded_term(every_term[k]) for k in places]
+        every_term = [(term, j) for j, terms in enumerate(loops.terms) for term in terms]
+        coded = [lanes.coded_term(every_term[k][0]) for k in places]
         codes = np.array([code for code, _ in coded], dtype=np.int64).reshape(-1, 5)
         shapes = np.array([numbers for _, numbers in coded]).reshape(-1, 11)
-        has_state = codes[:, 2] == BRISTLES
-        shapes[has_state, 3] = np.arange(has_state.sum())
-        terms = lanes.Terms(codes, shapes, loops.values[places], spans)
+        of_joint = np.array([np.flatnonzero(own == every_term[k][1])[0] for k in places], dtype=int)
+        states = np.flatnonzero(codes[:, 2] == BRISTLES)
+        bristles = np.column_stack([states, of_joint[states]])
+        terms = lanes.Terms(codes, shapes, loops.values[places], spans, bristles)
         drives = np.column_stack(
             [x[own] for x in (loops.armature, loops.kp, loops.kd, loops.limit)] + [affine]
         )
@@ -278,7 +271,7 @@ class ClosedLoopRobot:
         q, v = np.zeros((2, samples, n, lanes.LANES))
         S = np.zeros((samples, outputs * n, len(numbers), lanes.LANES))
         q[0], v[0] = course.start
-        work = lanes.work_of(n, len(numbers), int(has_state.sum()))
+        work = lanes.work_of(n, len(numbers), len(states))
         kinds, motion = lanes.Columns(columns, sums, along), lanes.Motion(q, v, S)
         failed = lanes.roll_out(robot, kinds, course, motion, work, self.corrects)
         if failed >= 0 or not (np.abs(v) < _FASTEST).all():
@@ -292,7 +285,7 @@ class ClosedLoopRobot:
 
     def _course(self, part: _Part, windows: Sequence[Window], loops: Loops) -> "Course":
         """Return the commands of a part's joints in a block of windows."""
-        lanes, laws = _lanes()
+        lanes = _lanes()
         samples = max(window.stop - window.start_row for window in windows)
         grids = [_Grid.of(window, samples, loops.rate) for window in windows]
         every = max(grid.least_steps(self.step, loops.rate) for grid in grids)
@@ -317,7 +310,7 @@ class ClosedLoopRobot:
                     continue
                 for i, j in enumerate(part.joints):
                     x = values[:, j].copy()  # contiguous and writable: else Numba compiles again
-                    laws.average_command(log.t, x, edges, loops.delay[j], mean, change)
+                    lanes.average_command(log.t, x, edges, loops.delay[j], mean, change)
                     command[:, i, k, own] = mean[of_step, None]
                     command[:, i, by_delay, own] = change[of_step, None]
         course: Course = lanes.Course(command, steps, ticks, every, start)
@@ -366,7 +359,7 @@ class _Grid:
         """Return the ends of all steps, and which steps start with a tick."""
         size = (len(self.stamps) - 1) * every
         times, is_tick = np.empty(size + 1), np.empty(size, dtype=bool)
-        _lanes()[1].divide_rows(self.stamps, self.ticks, times, is_tick)
+        _lanes().divide_rows(self.stamps, self.ticks, times, is_tick)
         return times, is_tick
 
 
@@ -382,9 +375,8 @@ def _parts(tree: Tree) -> list[_Part]:
 def _arranged(loops: Loops, joints: Array) -> tuple[Array, Array, Array]:
     """Return the indices in ``loops.values`` of the terms of joints, joint by joint.
 
-    Also, for each joint, the index of its first term, of its first bristle or affine term, and of
-    its end, shape (n, 3); and the sums of its affine terms: constant, by the speed, and by its
-    direction, shape (n, 3).
+    Also, for each joint, the index of its first term, and of its first bristle or affine term,
+    (n, 2); and the sums of its affine terms: constant, by the speed, by its direction, (n, 3).
     """
     first = np.cumsum([0, *map(len, loops.terms)])
     places, spans, affine = list[int](), [], np.zeros((len(joints), 3))
@@ -396,17 +388,16 @@ def _arranged(loops: Loops, joints: Array) -> tuple[Array, Array, Array]:
                 rest.append(k)
             else:
                 (rest if isinstance(term, Bristles) else others).append(k)
-        middle = len(places) + len(others)
-        spans.append([len(places), middle, middle + len(rest)])
+        spans.append([len(places), len(places) + len(others)])
         places += [*others, *rest]
     return np.array(places, dtype=int), np.array(spans, dtype=np.int64), affine
 
 
-def _lanes() -> tuple[ModuleType, ModuleType]:
-    """Return the compiled code of roll-outs and of laws, which imports Numba."""
-    from robotid.dynamics.simulation import law_lanes, loop_lanes
+def _lanes() -> ModuleType:
+    """Return the compiled code of roll-outs, which imports Numba."""
+    from robotid.dynamics.simulation import loop_lanes
 
-    return loop_lanes, law_lanes
+    return loop_lanes
 
 
 def _failed_at(
@@ -421,7 +412,7 @@ def _failed_at(
         row, i, lane = (int(k) for k in np.unravel_index(np.argmax(is_fast), v.shape))
         return row, lane, i, q[0, :, lane]
     before, change = last
-    size = np.where(np.isfinite(change), np.abs(change), np.inf)
+    size = np.nan_to_num(np.abs(change), nan=np.inf, posinf=np.inf)
     i, lane = (int(k) for k in np.unravel_index(np.argmax(size), size.shape))
     return row, lane, i, np.clip(np.nan_to_num(before[:, lane]), -_FASTEST, _FASTEST)
 
@@ -449,12 +440,10 @@ def _wrong_friction(model: RobotModel, loops: Loops, j: int, angle: float) -> st
     """Return which friction of a joint makes its motion impossible or ambiguous; else ""."""
     name = model.joints[j]
     for term in loops.terms[j]:
-        value, wanted = float(loops.values[loops.place(j, term)]), ""
-        if term.is_nonnegative and value < 0.0:
-            wanted = "0 or more"
-        elif value > term.highest:
-            wanted = f"at most {term.highest:g}"
-        if wanted:
+        value = float(loops.values[loops.place(j, term)])
+        is_negative = term.is_nonnegative and value < 0.0
+        if is_negative or value > term.highest:
+            wanted = "0 or more" if is_negative else f"at most {term.highest:g}"
             return (
                 f"the simulation of {name} has no solution: {name}.{term.name} is {value:.3g}, "
                 f"wanted {wanted}. Set other friction terms of {name} in [drives]"
@@ -498,5 +487,4 @@ def _mass_matrix(model: RobotModel, loops: Loops, joints: Array, q: Array) -> Ar
     bodies, every = model.with_parameters(pi), loops.zero.copy()
     every[joints] += q
     (M,) = rigid_mass_matrices(bodies, bodies.configurations(every[None]))
-    mass: Array = (M + np.diag(loops.armature))[np.ix_(joints, joints)]
-    return mass
+    return np.asarray((M + np.diag(loops.armature))[np.ix_(joints, joints)])

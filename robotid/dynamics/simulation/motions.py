@@ -1,4 +1,4 @@
-"""Reference motions: Fourier series, quintics from rest to rest, samples, legged robots."""
+"""Reference motions: Fourier series, quintics from rest to rest, samples."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,7 +8,6 @@ import numpy as np
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.typing import Array
-from robotid.data.base_motion import in_base, vector_part
 from robotid.robot.model import RobotModel
 
 _ORDER = 5  # of the polynomials through samples
@@ -26,11 +25,7 @@ class Motion(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class FourierTrajectory(Motion):
-    """A periodic motion q(t) = q0 + sum_k s_k sin(k w t) + c_k cos(k w t), w = 2 pi / period.
-
-    References:
-        Swevers et al. (1997), Optimal robot excitation and identification.
-    """
+    """A motion q0 + sum s_k sin(k w t) + c_k cos(k w t), w = 2 pi / period (Swevers 1997)."""
 
     q0: Array  # mean position, shape (n,) [rad or m]
     sine: Array  # coefficients s_k, shape (h, n) [rad or m]
@@ -58,10 +53,8 @@ class ProgramMotion(Motion):
     """The motion q(t) = q0 + A (a1 t^5 + a2 t^4 + a3 t^3), from rest to rest.
 
     With a1 = 6 / T^5, a2 = -15 / T^4, a3 = 10 / T^3 the motion is from q0 to q0 + A, with zero
-    velocity and acceleration at both ends. Before 0 and after T the robot is at rest.
-
-    References:
-        Tzvetkova, (28).
+    velocity and acceleration at both ends. Before 0 and after T the robot is at rest. See
+    Tzvetkova, (28).
     """
 
     amplitude: Array  # A, displacement of each joint, (n,), or (R, n) for R motions [rad or m]
@@ -92,10 +85,7 @@ class ProgramMotion(Motion):
 
 @dataclass(frozen=True, eq=False)
 class SampledMotion(Motion):
-    """A motion through samples: piecewise quintics through q, v and a, or a spline through q.
-
-    Both have a continuous acceleration. Time starts at the first sample.
-    """
+    """A motion through samples from time 0: quintics through q, v, a, or a spline through q."""
 
     t: Array  # shape (N,) [s]
     q: Array  # shape (N, n) [rad or m]
@@ -128,83 +118,17 @@ class SampledMotion(Motion):
         return q, v, a
 
 
-@dataclass(frozen=True, eq=False)
-class FloatingMotion(Motion):
-    """A motion of a robot whose base floats: splines through poses and joint positions."""
-
-    t: Array  # times, shape (N,) [s]
-    pose: Array  # pose of the base, as of ``BaseMotion``, shape (N, 7) [m, -]
-    q: Array  # joint positions, shape (N, n) [rad or m]
-    # which contacts touch the ground, shape (N, k), bool; each until the next sample
-    contacts: Array
-
-    @cached_property
-    def _samples(self) -> SampledMotion:
-        return SampledMotion(self.t, np.hstack([self.pose, self.q]))
-
-    @property
-    def duration(self) -> float:
-        """Duration [s]."""
-        return self._samples.duration
-
-    def touching(self, t: Array) -> Array:
-        """Return which contacts touch the ground, shape (N, k), bool: t (N,) [s]."""
-        rows = np.searchsorted(self.t - self.t[0], t + 1e-9, side="right") - 1
-        flags: Array = self.contacts[np.clip(rows, 0, len(self.t) - 1)]
-        return flags
-
-    def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
-        """Return q (N, 7 + n), v (N, 6 + n) and a (N, 6 + n), the twist with the axes of the base.
-
-        With the unit quaternion p / |p| of the spline p, w = 2 p* dp/dt / |p|^2 (vector part).
-        """
-        x, rate, change = self._samples.evaluate(t)
-        p, dp, ddp = x[:, 3:7], rate[:, 3:7], change[:, 3:7]
-        square = np.sum(p**2, axis=1, keepdims=True)
-        unit = p / np.sqrt(square)
-        w = 2.0 * vector_part(p, dp) / square
-        alpha = 2.0 * vector_part(p, ddp) / square
-        alpha -= 2.0 * np.sum(p * dp, axis=1, keepdims=True) / square * w
-        v = in_base(unit, rate[:, :3])
-        a = in_base(unit, change[:, :3]) - np.cross(w, v)
-        return (
-            np.hstack([x[:, :3], unit, x[:, 7:]]),
-            np.hstack([v, w, rate[:, 7:]]),
-            np.hstack([a, alpha, change[:, 7:]]),
-        )
-
-
 def random_fourier(
-    model: RobotModel,
-    rng: np.random.Generator,
-    *,
-    period: float = 10.0,
-    centre: Array | None = None,
+    model: RobotModel, rng: np.random.Generator, *, period: float = 10.0
 ) -> FourierTrajectory:
-    """Return a random motion within the limits of a robot.
-
-    Args:
-        model: The robot; the motion is within the position and speed limits of its URDF.
-        rng: Source of the coefficients.
-        period: Period [s].
-        centre: Mean position, shape (n,) [rad or m]; the middle of the limits, or 0, if None.
-
-    Raises:
-        DataError: If the centre lies outside the limits.
-    """
+    """Return a random motion about the middle of a robot's limits, or 0, within these limits."""
     n = len(model.joints)
     sine, cosine = rng.standard_normal((2, _HARMONICS, n)) / np.arange(1, _HARMONICS + 1)[:, None]
-    middle = [(j.lower + j.upper) / 2 if j.has_limits else 0.0 for j in model.limits]
-    mean = np.array(middle) if centre is None else centre
+    mean = np.array([(j.lower + j.upper) / 2 if j.has_limits else 0.0 for j in model.limits])
     amplitude, speed = np.empty(n), np.empty(n)
     for j, joint in enumerate(model.limits):
         size, highest = _LARGEST[joint.type == "prismatic"]
         room = min(joint.upper - mean[j], mean[j] - joint.lower) if joint.has_limits else np.inf
-        if room <= 0:
-            raise DataError(
-                f"the centre {mean[j]:g} of joint {joint.name!r} is not inside its limits "
-                f"{joint.lower:g} to {joint.upper:g}"
-            )
         amplitude[j] = min(size, 0.9 * room)
         speed[j] = min(highest, 0.9 * joint.velocity) if joint.velocity > 0 else highest
     unit = FourierTrajectory(np.zeros(n), sine, cosine, period)

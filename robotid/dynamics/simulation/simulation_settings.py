@@ -22,6 +22,7 @@ from robotid.base.settings import (
 )
 from robotid.base.typing import Array
 from robotid.data.log import suggestion
+from robotid.data.signal_settings import or_false
 
 #: A number for every joint, or numbers by joint; other joints have the default.
 PerJoint: TypeAlias = float | Mapping[str, float]
@@ -53,14 +54,6 @@ def _per_joint(least: float, most: float, words: str) -> Mapping[str, Any]:
 LEVEL = _per_joint(0.0, 1e12, "0 to 1e12")
 GAIN = _per_joint(1e-9, 1e12, "1e-9 to 1e12")  # in any unit: squares do not overflow
 DELAY = _per_joint(0.0, 1.0, "0 to 1 s")
-
-
-def _effort_from(value: float | bool) -> float | None:
-    if value is True:
-        raise SettingsError(
-            "effort is true, wanted a factor of the URDF's effort limits, or false for no limits"
-        )
-    return None if value is False else value
 
 
 @dataclass(frozen=True)
@@ -128,9 +121,9 @@ class Actuator(Settings):
         None,
         "torque limit of each drive, relative to the URDF's effort limit; false: no limit",
         within=POSITIVE,
-        reads=(int, float, bool),
-        load=_effort_from,
-        dump=lambda value: False if value is None else value,
+        **or_false(
+            "effort is true, wanted a factor of the URDF's effort limits, or false for no limits"
+        ),
     )
     limits: Mapping[str, float] = setting(
         {},
@@ -218,9 +211,7 @@ class Payload(Settings):
 
     link: str = setting("", "name of the link; the last moving one if not stated")
     mass: float = setting(
-        0.0,
-        "mass [kg]; 0: no payload",
-        within=Range("0 to 1e9 kg", lambda x: 0 <= x <= 1e9),
+        0.0, "mass [kg]; 0: no payload", within=Range("0 to 1e9 kg", lambda x: 0 <= x <= 1e9)
     )
     com: tuple[float, float, float] = setting(
         (0.0, 0.0, 0.0),

@@ -1,4 +1,4 @@
-"""The simulated robot: a plant by Pinocchio's forward dynamics, a controller, and its log."""
+"""The simulated robot: a plant by Pinocchio's forward dynamics, a controller, sensors, its log."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -11,19 +11,20 @@ from robotid.base.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.base.typing import Array, ProgressCallback, ignore_progress
 from robotid.data.log import Log, Trajectory
 from robotid.dynamics.prediction import predict, remember
-from robotid.dynamics.simulation.motions import FloatingMotion, Motion
-from robotid.dynamics.simulation.sensors import Run, measure, supported
+from robotid.dynamics.simulation.motions import Motion
 from robotid.dynamics.simulation.simulation_settings import (
     Actuator,
     Controller,
     Noise,
     Payload,
+    PerJoint,
+    Sensors,
     Simulation,
     by_joint,
 )
 from robotid.robot.bodies import link_transfer
 from robotid.robot.drive_term import DriveTerm, MemorylessTerm
-from robotid.robot.drives import Bristles, Coulomb, Lag, Offset, Viscous
+from robotid.robot.drives import Bristles, Lag
 from robotid.robot.mass_matrix import drive_inertia, rigid_mass_matrices
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -33,11 +34,11 @@ _ELASTIC_STEP = 0.3  # largest step, relative to 1 / w of the fastest elastic ge
 _SHORTEST_STEP = 1e-6  # smallest step of the integration; a stiffer gear is refused [s]
 _MOST = 2e7  # largest number of steps of a simulation: half an hour ...
 _MOST_EACH = 100_000  # ... and between two samples
+_TICK = 1e-6  # smallest step between time stamps [s]
 _CHUNK = 1024  # number of steps for which a motion is evaluated together
 _LEAST_INERTIA = 0.02  # smallest inertia in the computation of PD gains [kg m^2 or kg]
 _ITERATIONS = 200  # of the fixed point of load and load-dependent friction
 _SETTLED = 1e-12  # relative change of the load at convergence
-_SIMPLE = (Coulomb, Viscous, Offset)
 _SIGN_SPEED = 2e-4  # speed over which the plant's Coulomb friction reverses [rad/s or m/s]
 
 # ROS34PW2, a Rosenbrock W-method: order 3 for any Jacobian approximation, L-stable
@@ -52,6 +53,19 @@ _BELOW[2, :2] = -9.0338057013044082e-01, 5.4180672388095326e-02
 _BELOW[3, :3] = 2.4212380706095346e-01, -1.2232505839045147e00, 5.4526025533510214e-01
 _WEIGHTS = np.array([*_BELOW[3, :2], 1.5452602553351020e00, _GAMMA])
 _STAGES = _ALPHA.sum(axis=1)  # times of the stages [steps]
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """The exact motion of a robot; arrays of shape (N, n)."""
+
+    t: Array  # shape (N,) [s]
+    q: Array  # [rad or m]
+    v: Array  # [rad/s or m/s]
+    a: Array  # [rad/s^2 or m/s^2]
+    tau: Array  # [N m or N]
+    reference: Array  # reference position [rad or m]
+    saturated: Array  # share of the time at the torque limit of each drive, (n,) [-]
 
 
 def simulate(
@@ -86,25 +100,17 @@ def follow(
 
     The plant is ``RobotPlant`` with the parameters pi. An elastic gear has the motor angle th and
     the torque tau = k dead(th - q) + d (w - v); rotor and friction are then on the motor's side.
-    The integrator is a Rosenbrock W-method of order 3, which is stable with stiction.
-
-    References:
-        Rang, Angermann (2005), New Rosenbrock W-methods of order 3 for partial differential
-        algebraic equations of index 1.
+    The integrator is a Rosenbrock W-method of order 3, which is stable with stiction. See Rang,
+    Angermann (2005), New Rosenbrock W-methods of order 3 for partial differential algebraic
+    equations of index 1.
     """
     _check_size(duration * rate, 1)
     t = np.arange(round(duration * rate) + 1) / rate
     loaded = carried(model, pi, settings.payload)
     deflection = settings.payload.start if settings.payload.mass > 0 else math.inf
-    if not model.free_flyer:
-        model.require_fixed("simulation")
+    model.require_fixed("simulation")
     if settings.controller.kind == "perfect":
         return _perfect(model, pi, loaded, motion, t, deflection)
-    if model.free_flyer:
-        raise SettingsError(
-            f"controller: kind is {settings.controller.kind}, wanted perfect: a robot whose base "
-            "floats tracks the motion exactly. State --controller perfect"
-        )
     loops = [_Loop(model, x, settings) for x in (pi, loaded)]
     steps = max(1, math.ceil(1.0 / rate / min(loop.longest_step for loop in loops) - 1e-9))
     _check_size(len(t), steps)
@@ -112,11 +118,11 @@ def follow(
     loop, *later = loops if deflection > 0 else loops[1:]
     measured = np.empty((len(t), 4, len(model.joints)))
     reference, limited = np.empty_like(measured[:, 0]), np.zeros(len(model.joints))
-    y: Array | None = None
+    y = np.empty(0)
     for k, wanted in enumerate(_wanted(loop.controller, motion, len(t), steps, h)):
         if later and t[k] >= deflection - 1e-9 / rate:
             loop = later.pop()
-        y = loop.start(*wanted[0, 0, :3]) if y is None else y
+        y = y if k else loop.start(*wanted[0, 0, :3])
         F = loop.friction(y)
         f = loop.rate(y, wanted[0, 0], F)
         measured[k], reference[k] = loop.measured(y, f, wanted[0, 0]), wanted[0, 0, 0]
@@ -197,12 +203,7 @@ def _perfect(
         robot = model.with_reference(x)
         torques += predict(robot, [x], remember(robot, rows))
     tau = np.where((t >= deflection)[:, None], torques[-1], torques[0])
-    n = len(model.joints)
-    if isinstance(motion, FloatingMotion):
-        tau, stand = supported(model, motion, t, (q, v, a), tau)
-        q, v, a = (x[:, x.shape[1] - n :] for x in (q, v, a))
-        return Run(t, q, v, a, tau, q, np.zeros(n), stand)
-    return Run(t, q, v, a, tau, q, np.zeros(n))
+    return Run(t, q, v, a, tau, q, np.zeros(len(model.joints)))
 
 
 def delay(model: RobotModel, pi: Array, settings: Simulation) -> Array:
@@ -253,8 +254,6 @@ class RobotPlant:
     """
 
     def __init__(self, model: RobotModel, pi: Array) -> None:
-        if model.free_flyer:
-            raise DataError("the base floats; forward dynamics need a robot with a fixed base")
         model.require_fixed("simulation")
         if pi.shape != (len(model.layout.names),):
             raise DataError(f"pi has shape {pi.shape}, wanted ({len(model.layout.names)},)")
@@ -264,41 +263,35 @@ class RobotPlant:
         self.armature = drive_inertia(model.layout, pi)  # (n, n)
         self.ratios = model.layout.drive_ratios  # (d, n)
         self._share = self.ratios / np.sum(self.ratios**2, axis=1, keepdims=True).clip(min=1e-300)
-        self._simple, self._groups = _grouped(model, pi)
+        self._groups = _grouped(model, pi)
         self.n_states = sum(g.states.stop - g.states.start for g in self._groups)
         self.is_loaded = any(_is_loaded(g.term) for g in self._groups)
-        G, A = model.velocity_map, self.armature
+        G, A, engine = model.velocity_map, self.armature, model.pin_model
         # Pinocchio's own joints, each with its own rotor: its ABA is sufficient
-        self._is_plain = np.array_equal(G, np.eye(len(G))) and np.array_equal(
-            A, np.diag(A.diagonal())
-        )
-        self._is_angle = (
-            model.pin_model.nq == model.pin_model.nv and not model.position_offset.any()
-        )
+        has_own_rotors = np.array_equal(A, np.diag(A.diagonal()))
+        self._is_plain = np.array_equal(G, np.eye(len(G))) and has_own_rotors
+        self._is_angle = engine.nq == engine.nv and not model.position_offset.any()
         self._driven = pin.Model(self._bodies.pin_model)
         if self._is_plain:
             self._driven.armature = A.diagonal().copy()
 
     def mass_matrix(self, q: Array) -> Array:
         """Return D(q), the mass matrix with the drives' armature, shape (n, n)."""
+        x = self._configuration(q)
         if self._is_plain:
-            mass: Array = pin.crba(self._driven, self._data, self._configuration(q))
-            return mass.copy()
-        x = self.model.configurations(q[None])
-        mass = rigid_mass_matrices(self._bodies, x, self._data)[0] + self.armature
-        return mass
+            return np.array(pin.crba(self._driven, self._data, x))
+        rigid = rigid_mass_matrices(self._bodies, x[None], self._data)[0]
+        return np.asarray(rigid + self.armature)
 
     def bodies_torque(self, q: Array, v: Array, a: Array) -> Array:
         """Return the inverse dynamics of the bodies alone, shape (n,) [N m or N]."""
         G, x = self.model.velocity_map, self._configuration(q)
-        rigid: Array = G.T @ pin.rnea(self._bodies.pin_model, self._data, x, G @ v, G @ a)
-        return rigid
+        return np.asarray(G.T @ pin.rnea(self._bodies.pin_model, self._data, x, G @ v, G @ a))
 
     def friction(self, q: Array, v: Array, z: Array | None = None) -> Friction:
         """Return the friction of the drives, without inertia and the sign of the speed."""
         angle, w = self.ratios @ q, self.ratios @ v
-        coulomb, viscous, offset = self._simple
-        along, rest, loaded = coulomb.copy(), viscous * w + offset, np.zeros(len(w))
+        along, rest, loaded = np.zeros((3, len(w)))
         for group in self._groups:
             term, drives, theta = group.term, group.drives, group.theta
             if isinstance(term, Bristles):
@@ -315,15 +308,13 @@ class RobotPlant:
     def friction_torque(self, F: Friction, v: Array, load: Array) -> Array:
         """Return the friction torque of the drives under a load (n,), shape (n,) [N m or N]."""
         sign = np.tanh(self.ratios @ v / _SIGN_SPEED)
-        torque: Array = self.ratios.T @ (self._along(F, load) * sign + F.rest)
-        return torque
+        return np.asarray(self.ratios.T @ (self._along(F, load) * sign + F.rest))
 
     def chord(self, F: Friction, v: Array, load: Array) -> Array:
         """Return the friction with the sign of the speed, divided by the speed, shape (n, n)."""
         x = np.maximum(np.abs(self.ratios @ v) / _SIGN_SPEED, 1e-6)  # tanh(x) / x is 1 at 0
         slope = np.maximum(self._along(F, load), 0.0) * np.tanh(x) / (x * _SIGN_SPEED)
-        over: Array = (self.ratios.T * slope) @ self.ratios
-        return over
+        return np.asarray((self.ratios.T * slope) @ self.ratios)
 
     def _along(self, F: Friction, load: Array) -> Array:
         """Return the friction that has the sign of the speed, shape (d,)."""
@@ -342,11 +333,7 @@ class RobotPlant:
         return rate, end
 
     def acceleration(self, q: Array, v: Array, u: Array, F: Friction | None = None) -> Array:
-        """Return the acceleration D(q)^-1 (u - C(q, v)) of a torque, shape as q, (n,) or (N, n).
-
-        References:
-            Tzvetkova, (11).
-        """
+        """Return the acceleration D(q)^-1 (u - C(q, v)), (n,) or (N, n) (Tzvetkova, (11))."""
         if q.ndim == 2:
             return np.stack([self.acceleration(*one) for one in zip(q, v, u, strict=True)])
         F = self.friction(q, v) if F is None else F
@@ -360,8 +347,7 @@ class RobotPlant:
         x, G = self._configuration(q), self.model.velocity_map
         if self._is_plain:
             robot = self._driven if rotors else self._bodies.pin_model
-            a: Array = pin.aba(robot, self._data, x, v, tau)
-            return a.copy()
+            return np.array(pin.aba(robot, self._data, x, v, tau))
         D = rigid_mass_matrices(self._bodies, x[None], self._data)[0] + rotors * self.armature
         bias = G.T @ pin.nonLinearEffects(self._bodies.pin_model, self._data, x, G @ v)
         return np.linalg.solve(D, tau - bias)
@@ -378,8 +364,7 @@ class RobotPlant:
         for _ in range(_ITERATIONS):
             before, load = load, bare - slope @ np.abs(load)
             if np.abs(load - before).max() <= _SETTLED * (1.0 + np.abs(load).max()):
-                settled: Array = a - per_load @ np.abs(load)
-                return settled
+                return np.asarray(a - per_load @ np.abs(load))
         raise NotConvergedError(
             f"load-dependent friction does not converge in {_ITERATIONS} steps: its parameters are "
             "so large that the drives lock. Set smaller parameters",
@@ -390,33 +375,24 @@ class RobotPlant:
         """Return Pinocchio's configuration, shape (nq,)."""
         if self._is_plain and self._is_angle:
             return q
-        x: Array = self.model.configurations(q[None])[0]
-        return x
+        return np.asarray(self.model.configurations(q[None])[0])
 
 
-def _grouped(model: RobotModel, pi: Array) -> tuple[Array, tuple[_Group, ...]]:
-    """Return the friction terms of the drives, without inertia and terms of the measurement.
-
-    First Coulomb friction, viscous friction and offset of each drive, shape (3, d), which depend
-    only on the speed; then the others.
-    """
-    layout = model.layout
-    theta, simple = pi[layout.n_inertial :], np.zeros((3, len(layout.drives)))
+def _grouped(model: RobotModel, pi: Array) -> tuple[_Group, ...]:
+    """Return the friction terms of the drives, without inertia and terms of the measurement."""
+    layout, theta = model.layout, pi[model.layout.n_inertial :]
     terms: dict[Bristles | MemorylessTerm, list[int]] = {}
-    for k, (d, term) in enumerate(layout.drive_parameters):
-        if type(term) in _SIMPLE:
-            simple[_SIMPLE.index(type(term)), d] += theta[k]
-        elif theta[k] != 0.0 and isinstance(term, Bristles | MemorylessTerm):
+    for k, (_, term) in enumerate(layout.drive_parameters):
+        if theta[k] != 0.0 and isinstance(term, Bristles | MemorylessTerm):
             terms.setdefault(term, []).append(k)
     groups, states = [], 0
     for term, numbers in terms.items():
         drives = [layout.drive_parameters[k][0] for k in numbers]
         is_all = drives == list(range(len(layout.drives)))
-        own = slice(states, states + len(numbers) * isinstance(term, Bristles))
+        first, states = states, states + len(numbers) * isinstance(term, Bristles)
         chosen = slice(None) if is_all else np.array(drives)
-        groups.append(_Group(term, chosen, theta[numbers], own))
-        states = own.stop
-    return simple, tuple(groups)
+        groups.append(_Group(term, chosen, theta[numbers], slice(first, states)))
+    return tuple(groups)
 
 
 def _is_loaded(term: DriveTerm) -> bool:
@@ -424,17 +400,16 @@ def _is_loaded(term: DriveTerm) -> bool:
 
 
 class _Loop:
-    """The true robot and its controller as dy/dt = f(y, reference).
-
-    y has q and v of the joints, th and w of the motors if gears are elastic, then the bristle
-    deflections of presliding.
-    """
+    """The robot and its controller, dy/dt = f(y, reference); y: joints, motors, bristles."""
 
     def __init__(self, model: RobotModel, pi: Array, settings: Simulation) -> None:
         self.plant = plant = RobotPlant(model, pi)
         mass = plant.mass_matrix(np.zeros(len(model.joints)))
         self.controller = _Torque(model, settings.controller, mass)
-        self.limit = _limits(model, settings.actuator)
+        share = settings.actuator.effort or 0.0
+        urdf = [share * max(joint.effort, 0.0) or np.inf for joint in model.limits]
+        limits = by_joint(settings.actuator.limits, model.joints, "actuator: limits", np.nan)
+        self.limit = np.where(np.isnan(limits), urdf, limits)  # [N m or N]
         self.has_limits, self.n = bool(np.isfinite(self.limit).any()), len(model.joints)
         self.is_at_motor = settings.sensors.side == "motor"
         self.gear = _Gear(plant, settings.actuator) if settings.actuator.is_elastic else None
@@ -477,11 +452,8 @@ class _Loop:
 
     def is_limited(self, y: Array, wanted: Array) -> Array | bool:
         """Return which drives are at their torque limit, shape (n,), bool."""
-        if not self.has_limits:
-            return False
         _, _, motor, w, _ = self._parts(y)
-        limited: Array = np.abs(self.torque(motor, w, wanted)) >= self.limit
-        return limited
+        return self.has_limits and np.abs(self.torque(motor, w, wanted)) >= self.limit
 
     def measured(self, y: Array, f: Array, wanted: Array) -> Array:
         """Return q, v, a and tau on the side of the sensors, shape (4, n)."""
@@ -550,8 +522,7 @@ def _advance(loop: _Loop, y: Array, wanted: Array, h: float, F: Friction, f: Arr
     for i in range(1, 4):
         x = y + h * (_ALPHA[i] @ K)
         K[i] = solve(loop.rate(x, wanted[i], loop.friction(x)), _BELOW[i] @ K)
-    after: Array = y + h * (_WEIGHTS @ K)
-    return after
+    return y + h * (_WEIGHTS @ K)
 
 
 class _Gear:
@@ -580,13 +551,11 @@ class _Gear:
         twist = motor - q
         deflection = twist - np.clip(twist, -self.play, self.play)
         is_engaged = np.abs(twist) >= self.play
-        tau: Array = self.k * deflection + self.d * (w - v) * is_engaged
-        return tau
+        return np.asarray(self.k * deflection + self.d * (w - v) * is_engaged)
 
     def twist(self, tau: Array) -> Array:
         """Return the angle of the motor relative to the joint for a torque at rest."""
-        twist: Array = tau / self.k + self.play * np.sign(tau)
-        return twist
+        return tau / self.k + self.play * np.sign(tau)
 
     def fastest(self, bodies: Array) -> float:
         """Return the largest natural frequency or damping rate of the gears [1/s]."""
@@ -621,13 +590,72 @@ class _Torque:
         if self.kind == "computed_torque":
             w = self.w
             return self.nominal.bodies_torque(q, v, a_r + w**2 * (q_r - q) + 2 * w * (v_r - v))
-        u: Array = forward + self.kp * (q_r - q) + self.kd * (v_r - v)
-        return u
+        return np.asarray(forward + self.kp * (q_r - q) + self.kd * (v_r - v))
 
 
-def _limits(model: RobotModel, actuator: Actuator) -> Array:
-    """Return the torque limit of each drive, shape (n,) [N m or N]; infinite without a limit."""
-    stated = by_joint(actuator.limits, model.joints, "actuator: limits", np.nan)
-    share = actuator.effort
-    urdf = [share * j.effort if share and j.effort > 0 else np.inf for j in model.limits]
-    return np.where(np.isnan(stated), urdf, stated)
+def measure(
+    run: Run,
+    sensors: Sensors,
+    joints: tuple[str, ...],
+    rng: np.random.Generator,
+    *,
+    delay: Array | float = 0.0,
+) -> Log:
+    """Return the log of a robot's motion by sensors, its torques with a delay (n,) [s].
+
+    Delay, noise and rounding are applied in this order. Jitter changes only the time stamps.
+    """
+
+    def of(value: PerJoint, name: str) -> Array:
+        return by_joint(value, joints, f"sensors: {name}")
+
+    noise, step, n = sensors.noise, sensors.step, len(joints)
+    v = _delayed(run.t, run.v, np.full(n, sensors.velocity_delay))
+    tau = _delayed(run.t, run.tau, sensors.torque_delay + delay * np.ones(n))
+    share = of(noise.tau, "noise.tau") * np.sqrt(np.mean(tau**2, axis=0))
+    level = np.hypot(share, of(noise.torque, "noise.torque"))
+    signals = {
+        "q": _noisy(run.q, of(noise.q, "noise.q"), rng),
+        "v": _noisy(v, of(noise.v, "noise.v"), rng),
+        "tau": _noisy(tau, level, rng),
+    }
+    q, v, tau = (_rounded(x, of(getattr(step, k), f"step.{k}")) for k, x in signals.items())
+    logged = np.ones(len(run.t), dtype=bool)
+    if sensors.dropped:
+        logged = rng.random(len(logged)) >= sensors.dropped
+        if logged.sum() < 2:
+            raise DataError(
+                f"{logged.sum()} of {len(logged)} samples remain, wanted at least 2. Set a smaller "
+                "dropped, or a longer duration"
+            )
+    t = run.t
+    if sensors.jitter:
+        spread = _TICK * np.arange(len(t))
+        t = t + sensors.jitter * rng.standard_normal(len(t))
+        t = np.maximum.accumulate(t - spread) + spread
+    return Log(
+        t=t[logged], q=q[logged], tau=tau[logged], joints=joints,
+        v=v[logged] if sensors.velocity else None,
+        a=run.a[logged] if sensors.acceleration else None,
+    )  # fmt: skip
+
+
+def _delayed(t: Array, values: Array, delay: Array) -> Array:
+    """Return values delayed by joint; before the start, the first values."""
+    if not delay.any():
+        return values
+    columns = [np.interp(t - d, t, x) for d, x in zip(delay, values.T, strict=True)]
+    return np.column_stack(columns)
+
+
+def _noisy(values: Array, level: Array, rng: np.random.Generator) -> Array:
+    """Return values with white noise, its standard deviation given by joint."""
+    if not level.any():
+        return values
+    return values + level * rng.standard_normal(values.shape)
+
+
+def _rounded(values: Array, step: Array) -> Array:
+    """Return values rounded to steps, for the joints that have one."""
+    size = np.where(step > 0, step, 1.0)
+    return np.where(step > 0, np.round(values / size) * size, values)

@@ -44,17 +44,15 @@ def perturbed_bodies(model: RobotModel, size: float, rng: np.random.Generator) -
 
     For each body J' = J^1/2 exp(S) J^1/2. S is symmetric and normal, with ten independent
     coordinates of equal standard deviation in the metric d^2 = 1/2 tr(log(J^-1 J')^2). The
-    distribution does not depend on frame, units or body, and J' is positive definite if J is.
-
-    References:
-        Wensing, Kim, Slotine (2018), Linear Matrix Inequalities for Physically Consistent
-        Inertial Parameter Identification; Lee, Park (2018), A Geometric Algorithm for Robust
-        Multibody Inertial Parameter Identification, (13).
+    distribution does not depend on frame, units or body, and J' is positive definite if J is. See
+    Wensing, Kim, Slotine (2018), Linear Matrix Inequalities for Physically Consistent Inertial
+    Parameter Identification; Lee, Park (2018), A Geometric Algorithm for Robust Multibody Inertial
+    Parameter Identification, (13).
     """
     bodies = model.standard_parameters()[: model.layout.n_inertial]
     if size == 0.0:
         return bodies
-    found = []
+    perturbed = []
     for name, J in zip(model.layout.bodies, pseudo_inertia(bodies), strict=True):
         values, axes = np.linalg.eigh(J)
         if values[0] < _IMPOSSIBLE * max(values[-1], 0.0) or values[-1] < 0:
@@ -64,8 +62,13 @@ def perturbed_bodies(model: RobotModel, size: float, rng: np.random.Generator) -
                 "(robotid inspect), or state inertials = 0 in [truth]"
             )
         root = axes * np.sqrt(np.maximum(values, 0.0)) @ axes.T
-        found.append(inertial_from_pseudo_inertia(root @ _random_factor(size, rng) @ root))
-    return np.concatenate(found)
+        S = np.zeros((4, 4))
+        S[np.triu_indices(4, 1)] = rng.standard_normal(6)
+        S = S + S.T + np.diag(np.sqrt(2.0) * rng.standard_normal(4))  # 1/2 tr(S^2): ten squares
+        values, axes = np.linalg.eigh(size * S)
+        factor = axes * np.exp(values) @ axes.T  # exp(size S)
+        perturbed.append(inertial_from_pseudo_inertia(root @ factor @ root))
+    return np.concatenate(perturbed)
 
 
 def another_robot(model: RobotModel, rng: np.random.Generator) -> Array:
@@ -86,16 +89,6 @@ def another_robot(model: RobotModel, rng: np.random.Generator) -> Array:
     for i, (_, term) in enumerate(model.layout.drive_parameters, start=size):
         pi[i] = rng.uniform(*term.typical)
     return pi
-
-
-def _random_factor(size: float, rng: np.random.Generator) -> Array:
-    """Return exp(S), S as in ``perturbed_bodies``: 1/2 tr(S^2) is a sum of ten squares."""
-    S = np.zeros((4, 4))
-    S[np.triu_indices(4, 1)] = rng.standard_normal(6)
-    S = S + S.T + np.diag(np.sqrt(2.0) * rng.standard_normal(4))
-    values, axes = np.linalg.eigh(size * S)
-    factor: Array = axes * np.exp(values) @ axes.T
-    return factor
 
 
 def _check(model: RobotModel, pi: Array) -> None:

@@ -12,8 +12,7 @@ import numpy as np
 from robotid.base.exceptions import DataError, RankDeficientError
 from robotid.base.text import period
 from robotid.base.typing import Array
-from robotid.data.alike_motions import alike_motions
-from robotid.data.log import Log, Trajectory
+from robotid.data.log import Log, Trajectory, alike_motions
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import turns_note
 from robotid.dynamics.factors import Factors, merge

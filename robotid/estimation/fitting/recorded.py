@@ -10,9 +10,9 @@ from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.factors import Factors, Reduction, compress_segments, join_segments
+from robotid.dynamics.prepared_logs import base_problem, independent_share
 from robotid.dynamics.problem import Block, Problem, concatenate
 from robotid.dynamics.rows import keep_inertial_rows
-from robotid.dynamics.used_rows import base_problem, independent_share
 from robotid.estimation.fitting.survey import ReducedPiece, SurveyedLog
 from robotid.estimation.work_plan import WorkPlan
 from robotid.robot.model import RobotModel

@@ -34,9 +34,9 @@ import numpy as np
 
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
-from robotid.data.measured_velocity import quantum
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import local_polynomial
+from robotid.data.units import quantum
 from robotid.dynamics.factors import Factors, Reduction
 from robotid.estimation.estimators.batch import solve_factor
 from robotid.estimation.fitting.recorded import Recordings

@@ -19,8 +19,7 @@ from robotid.base.findings import listed
 from robotid.base.text import seconds
 from robotid.base.typing import Array
 from robotid.data.base_motion import bias_at_rest
-from robotid.data.files.formats import open_table
-from robotid.data.files.read import LogLayout
+from robotid.data.files.read import LogLayout, open_table
 from robotid.data.files.table import Place, RowReader, Table
 from robotid.data.log import Log, Trajectory, blocks_of, map_stamps, median_step
 from robotid.data.signal_settings import SignalSettings
@@ -35,13 +34,18 @@ from robotid.data.signals import (
 )
 from robotid.data.units import check_reach, check_units
 from robotid.dynamics.base_parameters import BaseMapping
-from robotid.dynamics.completed_logs import closed_log, with_contacts
 from robotid.dynamics.constraint_rows import constrained, logged_base
-from robotid.dynamics.drive_columns import friction_speeds
 from robotid.dynamics.factors import Reduction
 from robotid.dynamics.prediction import is_loaded, remember
-from robotid.dynamics.rows import COMPILED, choose_engine
-from robotid.dynamics.used_rows import base_problem, prefers_measured, row_mask, static_rows
+from robotid.dynamics.prepared_logs import (
+    base_problem,
+    closed_log,
+    prefers_measured,
+    row_mask,
+    static_rows,
+    with_contacts,
+)
+from robotid.dynamics.rows import COMPILED, choose_engine, friction_speeds
 from robotid.estimation.work_plan import Workload
 from robotid.robot.model import RobotModel
 

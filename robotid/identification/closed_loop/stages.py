@@ -12,8 +12,8 @@ from robotid.base.exceptions import DataError, NotConvergedError
 from robotid.base.findings import listed
 from robotid.base.typing import Array, ProgressCallback, ignore_progress, report_stage
 from robotid.data.log import Log
-from robotid.data.measured_velocity import is_trustworthy
 from robotid.data.signal_settings import SignalSettings
+from robotid.data.units import is_trustworthy
 from robotid.diagnosis.logs.command_channels import largest_speeds
 from robotid.diagnosis.verdict.verdict import BEATEN, GOOD_POSITION, HARDLY
 from robotid.dynamics.simulation.loops import (

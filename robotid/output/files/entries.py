@@ -10,7 +10,7 @@ import numpy as np
 from robotid.base.files import finite, source_entry
 from robotid.base.settings import require_kind
 from robotid.base.versions import __version__, versions
-from robotid.data.transmission import Transmission
+from robotid.data.signal_settings import Transmission
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.drive_terms import DriveChoice

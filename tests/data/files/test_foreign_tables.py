@@ -14,8 +14,7 @@ import robotid
 from robotid.base.exceptions import DataError, ModelError
 from robotid.cli.convert import convert
 from robotid.cli.job import read_job
-from robotid.data.files.formats import open_table
-from robotid.data.files.read import read_log, read_logs, write_log
+from robotid.data.files.read import open_table, read_log, read_logs, write_log
 from robotid.data.files.table import Place
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource, LogUnits

@@ -30,9 +30,8 @@ from robotid.base.exceptions import DataError, MissingDependencyError
 from robotid.cli.convert import convert
 from robotid.data.base_motion import BaseColumns, base_state
 from robotid.data.files import csv_files, parquet_files
-from robotid.data.files.formats import open_table, write_columns
 from robotid.data.files.parquet_files import read_text_table, write_rows
-from robotid.data.files.read import lay_out, read_log, write_log
+from robotid.data.files.read import lay_out, open_table, read_log, write_columns, write_log
 from robotid.data.files.table import Place, RowReader, Table, with_even_stamps
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource, LogUnits

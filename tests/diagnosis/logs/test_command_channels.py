@@ -11,9 +11,9 @@ from helpers.findings import Figures
 from helpers.servos import Servo, chirps, record
 
 from robotid.base.exceptions import DataError
+from robotid.cli.doctor import doctor
 from robotid.data.files.read import read_log
 from robotid.data.signal_settings import LogSource
-from robotid.diagnosis.logs.check_logs import check_logs
 from robotid.diagnosis.logs.command_channels import check_commands
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -251,7 +251,7 @@ def test_sizes_of_loads_taken_for_torques_are_an_error(ur5, of_ur5):
     log = of_ur5
     v = np.gradient(log.q, log.t, axis=0)
     sizes = np.round(np.abs(3 * v + 10 * log.q + 0.1 * rng.standard_normal(v.shape)) / 0.05) * 0.05
-    findings = check_logs(ur5, replace(log, tau=sizes, has_torque=True))
+    findings = doctor(ur5, replace(log, tau=sizes, has_torque=True))
     assert {"unsigned_torque"} <= {f.code for f in findings if f.severity == "error"}
 
 
@@ -267,5 +267,5 @@ def test_loads_of_a_servo_arm_mapped_to_torques_are_an_error():
         f"tau_{joint}": f"loadsize_{name}" for joint, name in zip(model.joints, names, strict=True)
     }
     log = read_log(path, model.joints, source=source, columns=loads)
-    errors = {f.code for f in check_logs(model, log) if f.severity == "error"}
+    errors = {f.code for f in doctor(model, log) if f.severity == "error"}
     assert errors == {"unsigned_torque", "velocity_scale"}  # the jaw's dq is its motor's

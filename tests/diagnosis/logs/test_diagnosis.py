@@ -11,12 +11,12 @@ from helpers.driven import arm
 from helpers.synthetic import exact_log, perfect, truth
 
 from robotid.cli import main
+from robotid.cli.doctor import doctor
 from robotid.cli.job import Job, LogEntry, read_job
 from robotid.cli.logs import examine
-from robotid.data.files.formats import write_columns
-from robotid.data.files.read import write_log
+from robotid.data.files.read import write_columns, write_log
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.logs.check_logs import check_logs, diagnose, findings_to_dict
+from robotid.diagnosis.logs.check_logs import diagnose, findings_to_dict
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Sensors
 from robotid.dynamics.simulation.simulator import simulate
@@ -272,7 +272,7 @@ def test_check_logs_asks_the_doctor_with_the_default_signals(rng):
     log, other = (exact_log(model, truth(model), rng, samples=400) for _ in range(2))
     log = replace(log, tau=log.tau[:, [1, 0, 2]], path="fit.csv")
     kept = [replace(other, path="kept.csv"), replace(log, path="again.csv")]
-    found = check_logs(model, [log], validation=kept)
+    found = doctor(model, [log], validation=kept)
     assert found == diagnose(model, [log], kept, SignalSettings())
     said = {(finding.code, finding.where.partition(":")[0]) for finding in found}
     assert ("torque_order", "fit.csv") in said

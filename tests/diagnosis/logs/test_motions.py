@@ -7,8 +7,7 @@ import pytest
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
-from robotid.data.alike_motions import REPEATED, repeated_share
-from robotid.data.log import Trajectory
+from robotid.data.log import REPEATED, Trajectory, repeated_share
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.diagnosis.logs.check_logs import check_excitation

@@ -5,15 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.legged import with_other_bodies
-from helpers.stands import stand
+from helpers.stands import recorded, stand
 
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.diagnosis.logs.base_checks import check_base, check_wrenches
 from robotid.dynamics.constraint_rows import constraint_jacobian
 from robotid.dynamics.prediction import predict
-from robotid.dynamics.simulation.simulation_settings import Controller, Noise, Sensors, Simulation
-from robotid.dynamics.simulation.simulator import simulate
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -36,12 +34,9 @@ def log(robot):
     rng = np.random.default_rng(3)
     other = with_other_bodies(robot, rng)
     motion = stand(robot, np.tile([0.0, 0.8, -1.6], 4), 0.25, rng, parts=2)
-    settings = Simulation(
-        controller=Controller(kind="perfect"), sensors=Sensors(noise=Noise(torque=0.01))
-    )
-    return simulate(
-        other, other.standard_parameters(), motion, rate=80.0, duration=6.0, rng=rng,
-        settings=settings,
+    return recorded(
+        other, other.standard_parameters(), motion, rng, rate=80.0, duration=6.0,
+        acceleration=False,
     )  # fmt: skip
 
 

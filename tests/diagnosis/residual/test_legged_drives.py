@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.stands import stand
+from helpers.stands import recorded, stand
 
 from robotid.base.exceptions import SettingsError
 from robotid.data.signal_settings import SignalSettings
@@ -10,8 +10,6 @@ from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.residual.term_trials import Trials, take_sample
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.constraint_rows import without_forces
-from robotid.dynamics.simulation.simulation_settings import Controller, Noise, Sensors, Simulation
-from robotid.dynamics.simulation.simulator import simulate
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.fit import solve_recordings
 from robotid.estimation.fitting.recorded import Recordings
@@ -42,12 +40,8 @@ def solved(planted):
     for i, name in enumerate(plant.layout.names):
         joint, _, term = name.partition(".")
         pi[i] += size.get(term, planted.get(joint, 0.0) if term == "stribeck" else 0.0)
-    sensors = Sensors(noise=Noise(torque=0.01), acceleration=True)
     motion = stand(model, np.tile([0.0, 0.8, -1.6], 4), 0.25, rng, parts=6, length=2.0)
-    log = simulate(
-        plant, pi, motion, rate=100.0, duration=12.0, rng=rng,
-        settings=Simulation(controller=Controller(kind="perfect"), sensors=sensors),
-    )  # fmt: skip
+    log = recorded(plant, pi, motion, rng, rate=100.0, duration=12.0)
     signals = SignalSettings(cutoff=None, velocity="measured", acceleration="measured")
     recordings = Recordings(model, structural_mapping(model), [hold_log(model, log, signals)])
     return solve_recordings(recordings, EstimatorSettings("wls"), is_last=False).solution

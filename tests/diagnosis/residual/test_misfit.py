@@ -12,9 +12,9 @@ from helpers.misfits import EFFECTS
 from helpers.paths import ROOT
 
 from robotid.base.findings import Finding
+from robotid.cli.doctor import doctor
 from robotid.cli.job import job_from_settings, read_job
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.logs.check_logs import check_logs
 from robotid.diagnosis.residual.misfit import couplings as couplings_of
 from robotid.diagnosis.residual.misfit import (
     find_misfits,
@@ -195,7 +195,7 @@ def test_noise_of_any_colour_is_no_term(three, memory):
 def test_a_counterbalance_that_masses_can_imitate_is_never_good(four):
     """40 N m at the lift: gravity of the URDF's is held by the other joints."""
     logs = [log_with(four, 3, "balancing", 1, part=k) for k in (0, 1)]
-    guesses = check_logs(four, logs[:1], validation=logs[1:])
+    guesses = doctor(four, logs[:1], validation=logs[1:])
     assert {f.code for f in guesses if f.severity != "note"} == {"urdf_mismatch"}
     found = concluded(four, logs, AUTO)
     assert found.scale_check.gravity[LIFT] < 0.3

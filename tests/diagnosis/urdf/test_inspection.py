@@ -8,7 +8,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import ModelError
 from robotid.base.findings import Finding
-from robotid.diagnosis.logs.check_logs import check_logs
+from robotid.cli.doctor import doctor
 from robotid.diagnosis.urdf.inertials import explained_by_assumed, impossible_inertials
 from robotid.diagnosis.urdf.inspection import inspect_urdf
 from robotid.dynamics.base_parameters import structural_mapping
@@ -201,14 +201,14 @@ def test_the_doctor_names_rounded_angles_that_matter_once(tmp_path, rng):
         inspected(tmp_path, (COARSE[0], COARSE[1].replace("3.14", angle)))
         model = RobotModel.from_urdf(tmp_path / "two.urdf")
         log = exact_log(model, truth(model), rng)
-        findings = [f for f in check_logs(model, [log]) if f.code == "rounded_rpy"]
+        findings = [f for f in doctor(model, [log]) if f.code == "rounded_rpy"]
         assert len(findings) == expected, angle
         if findings:
             severity = {"3.14": "warning", "3.1416": "note"}[angle]
             assert (findings[0].severity, findings[0].where) == (severity, "joint elbow")
             assert "joint 'elbow' has rounded angles in rpy" in findings[0].message
         snapped = RobotModel.from_urdf(tmp_path / "two.urdf", snap_angles=True)
-        assert not [f for f in check_logs(snapped, [log]) if f.code == "rounded_rpy"]
+        assert not [f for f in doctor(snapped, [log]) if f.code == "rounded_rpy"]
 
 
 UNUSABLE = {

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.paths import URDF
 
-from robotid.dynamics.simulation.law_lanes import (
+from robotid.dynamics.simulation.loop_lanes import (
     coded_term,
     deflection,
     direction,

@@ -18,6 +18,7 @@ from robotid.dynamics.simulation.loops import (
     Loops,
     Window,
     cut_windows,
+    why_no_solution,
 )
 from robotid.robot.drives import (
     Asymmetric,
@@ -491,6 +492,13 @@ def test_friction_without_a_solution_is_named_with_joint_value_and_time(legs, te
     name, time = re.fullmatch(r"(\S+) at (\S+) s", caught.value.status).groups()
     assert name == log.name
     assert log.t[40] <= float(time) < log.t[50], "of the log, not of the window"
+
+
+def test_the_inertia_without_a_solution_is_that_at_the_positions_of_the_urdf(planar):
+    loops = loops_of(planar, zero=np.array([0.0, 0.9]))
+    M = pin.crba(planar.pin_model, planar.pin_model.createData(), np.array([0.0, 0.5]))
+    why = why_no_solution(planar, loops, np.array([0, 1]), np.array([0.0, -0.4]), 0, 2e-3)
+    assert f"its gain kp is 20 and its inertia {M[0, 0] + 0.01:.3g}, wanted kp below" in why
 
 
 def test_friction_that_falls_faster_than_inertia_allows_slips_as_in_small_steps(tmp_path):

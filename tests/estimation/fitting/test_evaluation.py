@@ -5,7 +5,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
-from robotid.dynamics.used_rows import row_mask
+from robotid.dynamics.prepared_logs import row_mask
 from robotid.estimation.fitting.evaluation import (
     TorqueSums,
     _joined,

@@ -7,7 +7,7 @@ import pytest
 from helpers.driven import EXACT, arm, driven_log
 from helpers.synthetic import truth
 
-from robotid.data.alike_motions import alike_motions
+from robotid.data.log import alike_motions
 from robotid.diagnosis.verdict.verdict import Determined, Predictions, judge
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings

@@ -13,7 +13,7 @@ from robotid.data.files.read import lay_out, write_log
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.used_rows import base_problem
+from robotid.dynamics.prepared_logs import base_problem
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.robust import LOSSES, find_outliers, loss_slope, loss_weight

@@ -12,8 +12,7 @@ from helpers.synthetic import truth
 
 from robotid.base.exceptions import DataError
 from robotid.data.base_motion import BaseColumns, BaseMotion, ImuFrame
-from robotid.data.files.formats import write_columns
-from robotid.data.files.read import lay_out, read_log, write_log
+from robotid.data.files.read import lay_out, read_log, write_columns, write_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogUnits, SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping

@@ -1,11 +1,16 @@
-"""Logs as a robot needs them: joints of closed chains, pose of the root, contacts that a log lacks.
+"""Logs as a robot needs them, completed by closed chains and contacts, and the rows that are used.
 
 The force f of each contact that a log does not state is the least-squares solution of
 J^T f = W pi - tau with the bodies of the URDF, over the rows of base and joints. A link that
 touches the ground has a force upwards, is low and hardly moves. The three are values of two normal
 distributions, with and without contact, whose parameters are those of the log.
+
+Measured and differentiated velocities are compared by their torque prediction errors: the torque of
+each joint is fitted separately with either on every other part of the log, and predicted on the
+other parts.
 """
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -20,12 +25,19 @@ from robotid.base.typing import Array
 from robotid.data.base_motion import BaseMotion
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
-from robotid.data.signals import process
-from robotid.dynamics.constraint_rows import constraint_jacobian
+from robotid.data.signals import process, standing_motion
+from robotid.data.units import coarse_velocities, is_timely, unlike_velocities
+from robotid.dynamics.base_parameters import BaseMapping
+from robotid.dynamics.constraint_rows import constraint_jacobian, measured_rows
 from robotid.dynamics.prediction import predict
+from robotid.dynamics.problem import Problem
+from robotid.dynamics.rows import friction_directions, friction_speeds, sure_rows
+from robotid.dynamics.torque import build_problem, joint_torque_regressor
 from robotid.robot.closure import Chains
 from robotid.robot.constraints import Contact, frame_id, link_positions
 from robotid.robot.model import RobotModel
+
+_log = logging.getLogger(__name__)
 
 _OPEN = 0.02  # largest error of a loop at logged positions, relative to the length of the robot
 _COMPUTED = 1e-5  # ... at computed ones
@@ -51,13 +63,12 @@ def closed_log(model: RobotModel, log: Log) -> Log:
 
 def _with_passive(model: RobotModel, log: Log) -> Log:
     """Return the log with the positions of all joints, and no torque of passive ones."""
-    missing = np.array([joint not in log.joints for joint in model.joints])
-    q, tau = np.zeros((2, len(log.t), len(missing)))
-    logged = np.flatnonzero(~missing)
-    places = [log.joints.index(model.joints[j]) for j in logged]
-    q[:, logged], tau[:, logged] = log.q[:, places], log.tau[:, places]
-    tau[:, np.isin(model.joints, model.passive)] = 0.0
     absent = [joint for joint in model.joints if joint not in log.joints]
+    missing = np.isin(model.joints, absent)
+    q, tau = np.zeros((2, len(log.t), len(missing)))
+    places = [log.joints.index(joint) for joint in model.joints if joint in log.joints]
+    q[:, ~missing], tau[:, ~missing] = log.q[:, places], log.tau[:, places]
+    tau[:, np.isin(model.joints, model.passive)] = 0.0
     if absent and not model.loops:
         raise DataError(
             f"{log.name} has no position of {listed(absent)}, and no loop determines it; log it, "
@@ -68,29 +79,27 @@ def _with_passive(model: RobotModel, log: Log) -> Log:
     if not absent:
         return replace(log, tau=tau)
     note = f"positions of {listed(absent)} are computed from the loops"
-    unused = {"v": "velocities", "a": "accelerations", "q_ref": "commands"}
-    unused = {name: noun for name, noun in unused.items() if getattr(log, name) is not None}
-    if unused:
-        note += f"; {listed(unused.values())} are not used, since these joints have none"
+    optional = ((log.v, "velocities"), (log.a, "accelerations"), (log.q_ref, "commands"))
+    if unused := [noun for values, noun in optional if values is not None]:
+        note += f"; {listed(unused)} are not used, since these joints have none"
     return replace(
         log, joints=model.joints, q=q, tau=tau, v=None, a=None, q_ref=None, v_ref=None,
         tau_ref=None, notes=(*log.notes, note),
     )  # fmt: skip
 
 
-def _closed(model: RobotModel, log: Log, q: np.ndarray, missing: np.ndarray) -> np.ndarray:
+def _closed(model: RobotModel, log: Log, q: Array, missing: Array) -> Array:
     """Return positions at which the loops close; refuse those at which they do not."""
     chains = Chains(model)
     if missing.any():
         q = chains.closed(q, missing)
     gaps = chains.gaps(q)
     allowed = (_COMPUTED if missing.any() else _OPEN) * model.length
-    samples = np.flatnonzero(~(gaps.max(axis=1) <= allowed))
-    if not len(samples):
+    is_open = ~(gaps.max(axis=1) <= allowed)
+    if not is_open.any():
         return q
-    k = int(samples[0])
-    loop = int(gaps[k].argmax())
-    joints = [joint for joint, is_missing in zip(model.joints, missing, strict=True) if is_missing]
+    k = int(np.argmax(is_open))
+    loop, joints = int(gaps[k].argmax()), np.array(model.joints)[missing].tolist()
     what = f"no position of {listed(joints)} closes" if joints else "the positions do not close"
     raise DataError(
         f"{log.name}: {what} the loop {model.loops[loop].name} at t = {seconds(log.t[k])} s: "
@@ -131,8 +140,8 @@ class FoundContact:
     """Whether a link touches the ground, sample by sample."""
 
     frame: str  # the link
-    touches: Array  # probability that it does, shape (N,)
-    force: Array  # its estimated force upwards, shape (N,) [N]
+    touches: Array  # probability that it does, (N,)
+    force: Array  # its estimated force upwards, (N,) [N]
 
     @property
     def shares(self) -> tuple[float, float, float]:
@@ -142,11 +151,7 @@ class FoundContact:
 
 
 def with_contacts(model: RobotModel, log: Log, signals: SignalSettings) -> Log:
-    """Return a log with all contacts of a robot; those that it does not state are found.
-
-    An undecided sample counts as contact: the force of the link is then eliminated. A note states
-    the shares.
-    """
+    """Return a log with all contacts of a robot; undecided samples of those found count as on."""
     flagged = [x.frame for x in model.contacts if not x.always]
     if all(frame in log.contacts for frame in flagged):
         return log
@@ -192,20 +197,17 @@ def find_contacts(
     force, velocity = _forces(model, motion, wanted)
     mass = sum(inertia.mass for inertia in model.pin_model.inertias)
     load = np.linalg.norm(model.pin_model.gravity.linear) * mass
-    heights = None
+    frames, heights = [x.frame for x in wanted], None
     if log.base.has_position:
-        frames = [x.frame for x in wanted]
         positions = link_positions(model.pin_model, model.configurations(motion.q), frames)
         heights = positions @ _up(model)
     touches = _probabilities(force / load, heights, velocity, len(model.contacts))
-    return motion.t, tuple(
-        FoundContact(x.frame, touches[:, k], force[:, k]) for k, x in enumerate(wanted)
-    )
+    return motion.t, tuple(map(FoundContact, frames, touches.T, force.T))
 
 
 def _up(model: RobotModel) -> Array:
     """Return the direction against gravity, shape (3,)."""
-    gravity: Array = model.pin_model.gravity.linear
+    gravity = model.pin_model.gravity.linear
     return np.asarray(-gravity / np.linalg.norm(gravity))
 
 
@@ -223,28 +225,21 @@ def _unknown(log: Log, frames: Sequence[str], why: str) -> DataError:
 def _forces(
     model: RobotModel, motion: Trajectory, wanted: Sequence[Contact]
 ) -> tuple[Array, Array]:
-    """Return forces upwards (N, k) [N] and velocities (N, k, 3) [m/s] of links, all touching.
-
-    The noise level of each row is that of its residuals.
-    """
+    """Return forces upwards (N, k) [N] and velocities (N, k, 3) [m/s] of links, all touching."""
+    names = [x.frame for x in wanted]
     turned = [
         replace(x, axes="world") if isinstance(x, Contact) and x in wanted else x
         for x in model.constraints
     ]
     model = replace(model.with_terms({}), constraints=tuple(turned))
     flags = np.ones((len(motion.t), len(model.contacts)), dtype=bool)
-    names = [x.frame for x in wanted]
-    stated = [not (x.always or x.frame in names) for x in model.contacts]
-    flags[:, stated] = motion.contacts
-    J, first = constraint_jacobian(model, motion.q, flags), 0
+    flags[:, [not (x.always or x.frame in names) for x in model.contacts]] = motion.contacts
+    J = constraint_jacobian(model, motion.q, flags)
     (torque,) = predict(model, [model.standard_parameters()], motion)
-    b = torque - motion.tau
-    known, starts = [], []
-    for x in model.constraints:
-        if isinstance(x, Contact):
-            known += [first + k for k in x.rows_measured]
-            starts += [first] if x.frame in names else []
-        first += x.sizes[x.kind]
+    b, known = torque - motion.tau, measured_rows(model)
+    firsts = np.cumsum([0, *(x.sizes[x.kind] for x in model.constraints)])
+    pairs = zip(model.constraints, firsts, strict=False)
+    starts = [first for x, first in pairs if isinstance(x, Contact) and x.frame in names]
     if motion.wrenches is not None:
         b -= np.einsum("kmj,km->kj", J[:, known], motion.wrenches)
     velocity = np.stack(
@@ -268,15 +263,13 @@ def _noise_of_groups(J: Array, b: Array, size: float) -> Array:
 
     The variances have the largest likelihood of the residuals (restricted maximum likelihood, by
     Fisher scoring). Reweighting by residuals over leverages has the same solution, but with levels
-    that differ by a factor of 10 it takes tens of rounds.
-
-    References:
-        Searle, Casella, McCulloch (1992), Variance Components, section 8.3.
+    that differ by a factor of 10 it takes tens of rounds. See Searle, Casella, McCulloch (1992),
+    Variance Components, section 8.3.
     """
     step, n = max(1, len(b) // _SAMPLES), b.shape[1]
     J, b, weak = J[::step], b[::step], np.eye(J.shape[1]) / (_WIDER * size) ** 2
     group = np.repeat([0, 1, 2], [3, 3, n - 6])
-    member = (group == np.arange(3)[:, None]).astype(float)[: group.max() + 1]  # (groups, n)
+    member = 1.0 * (group == np.unique(group)[:, None])  # (groups, n)
     variance, largest = np.full(len(member), np.mean(b**2) + _TINY), np.mean(b**2, axis=0).max()
     for _ in range(_SCORINGS):
         inverse = 1.0 / (variance @ member)
@@ -285,22 +278,20 @@ def _noise_of_groups(J: Array, b: Array, size: float) -> Array:
         P = np.diag(inverse) - A.swapaxes(1, 2) @ np.linalg.solve(N, A)  # (N, n, n)
         left = member @ np.mean(np.einsum("kij,kj->ki", P, b) ** 2, axis=0)
         curvature = member @ np.mean(P**2, axis=0) @ member.T
-        found = np.linalg.lstsq(curvature, left, rcond=None)[0]  # contacts may explain a group
-        before, variance = variance, np.clip(found, _LEAST * variance, largest + _TINY)
+        scored = np.linalg.lstsq(curvature, left, rcond=None)[0]  # contacts may explain a group
+        before, variance = variance, np.clip(scored, _LEAST * variance, largest + _TINY)
         variance = np.maximum(variance, _NEGLIGIBLE * variance.max()) + _TINY
         if np.abs(np.log(variance / before)).max() < _SETTLED:
             break
-    sigma: Array = np.sqrt(variance @ member)
-    return sigma
+    return np.asarray(np.sqrt(variance @ member))
 
 
 def _probabilities(force: Array, heights: Array | None, velocity: Array, feet: int) -> Array:
     """Return the probabilities of contact, shape (N, k), by values of this shape."""
-    p = (force > _LOAD / feet).astype(float)
+    p = 1.0 * (force > _LOAD / feet)
     for _ in range(_ROUNDS):
         if min(p.sum(), (1.0 - p).sum()) < _SOME:  # all or none touch: the force alone decides
-            alone: Array = expit((force - 0.25 * _LOAD / feet) / _NARROW[0])
-            return alone
+            return np.asarray(expit((force - 0.25 * _LOAD / feet) / _NARROW[0]))
         moving = velocity
         if heights is None:
             ground = np.einsum("ki,kij->kj", p, velocity) / (p.sum(axis=1)[:, None] + 1e-9)
@@ -324,8 +315,7 @@ def _evidence(x: Array, p: Array, narrow: float, off: float | None) -> Array:
         b = min(b, _spread(x - off, 1.0 - p))
     b = max(float(b), narrow)
     y = np.clip(x, min(on, off), max(on, off))  # values beyond both are no further evidence
-    ratio: Array = (((y - off) / b) ** 2 - ((y - on) / a) ** 2) / 2 - np.log(a / b)
-    return ratio
+    return np.asarray((((y - off) / b) ** 2 - ((y - on) / a) ** 2) / 2 - np.log(a / b))
 
 
 def _spread(x: Array, weights: Array) -> float:
@@ -334,3 +324,123 @@ def _spread(x: Array, weights: Array) -> float:
     total = np.cumsum(weights.ravel()[order])
     middle = order[np.searchsorted(total, 0.5 * total[-1])]
     return 1.4826 * float(np.abs(x.ravel()[middle]))
+
+
+_MOVES = 2e-3  # [rad/s] mean speed of a segment of a slow log from which its sign is certain
+_NEGLECTED = 0.02  # largest inertial torque that is neglected, over gravity's torque on a link
+_ROWS = 1000  # largest number of samples of a log that are used
+_PARTS = 8  # of the log, every other one fitted
+_BETTER = 0.85  # ratio of the errors below which the difference is significant
+_EXACT = 1e-6  # smallest relative error of a torque, for noise-free simulated logs
+_FEW = 3.0  # smallest number of rows per column for a joint
+_DEPENDENT = 1e-3  # relative singular value below which columns are dependent
+
+
+def row_mask(model: RobotModel, trajectory: Trajectory, min_velocity: float) -> Array:
+    """Return the used rows, (N, n_rows), bool: those where the sign of friction is certain."""
+    return sure_rows(model.layout, trajectory.v, min_velocity)
+
+
+def static_rows(model: RobotModel, log: Log, signals: SignalSettings) -> tuple[Trajectory, Array]:
+    """Return the samples of a log for a static model: rest phases and slow segments, one each.
+
+    Where a joint moves, friction has its sign. Where it is at rest, friction is anywhere within its
+    limits: rest phases are used without friction, which is part of the residual then, and only for
+    joints that move in fewer samples of the log than there are rest phases.
+    """
+    layout, n = model.layout, len(model.joints)
+    unit, least = layout.drive_speeds[:n], min(signals.min_velocity, _MOVES)
+    # inertial over gravity torque of a link of length l: a l / g and v^2 l / g
+    largest = _NEGLECTED * float(np.linalg.norm(model.pin_model.gravity.linear)) / model.length
+    size = np.where(np.isin(model.joints, list(layout.prismatic)), model.length, 1.0)
+    motion, at_rest = standing_motion(
+        log, signals.max_gap or np.inf, least * unit, np.sqrt(largest) * size, largest * size
+    )
+    moves = sure_rows(layout, motion.v, least)
+    used = moves | (at_rest[:, None] & (moves.sum(axis=0) <= at_rest.sum()))
+    signs, still = friction_directions(layout, motion.v, None), np.zeros_like(motion.v)
+    return replace(motion, v=still, direction=signs if signs.shape[1] else None), used
+
+
+def base_problem(
+    model: RobotModel,
+    mapping: BaseMapping,
+    trajectory: Trajectory,
+    weight: Array,
+    *,
+    with_mass: bool = False,
+    compiled: bool | None = None,
+) -> Problem:
+    """Return the problem of a trajectory in base parameters: weight (N, n_rows)."""
+    rows = weight.astype(float)
+    problem = build_problem(model, trajectory, rows, with_mass=with_mass, compiled=compiled)
+    return mapping.reduce(problem)
+
+
+def independent_share(signals: SignalSettings) -> float:
+    """The share of independent rows after the filter: its band over the Nyquist frequency."""
+    if signals.cutoff is None or signals.rate is None:
+        return 1.0
+    return min(1.0, 2.0 * signals.cutoff / signals.rate)
+
+
+def prefers_measured(model: RobotModel, logs: Sequence[Log], settings: SignalSettings) -> bool:
+    """Return whether velocity = "auto" uses the measured velocities of a log.
+
+    Measured velocities that are coarsely quantised or inconsistent with the positions are not used.
+    Others are used if they predict the torque about as well as differentiated velocities. If the
+    log has too little motion for this comparison, they are used if they are not delayed.
+    """
+    if any(coarse_velocities(log) or unlike_velocities(log) for log in logs):
+        return False
+    errors = np.concatenate([_errors(model, log, settings) for log in logs])
+    is_known = np.isfinite(errors).all(axis=1)
+    if not is_known.any():
+        return all(is_timely(log, settings.velocity_delay) for log in logs)
+    ratio = float(np.median(errors[is_known, 1] / errors[is_known, 0]))
+    is_better = ratio > _BETTER
+    _log.info(
+        "%s: velocity = 'auto' uses %s velocities: the torque prediction error on held-out "
+        "segments with differentiated velocities is %.2f times that with measured velocities",
+        logs[0].name, "measured" if is_better else "differentiated", ratio,
+    )  # fmt: skip
+    return is_better
+
+
+def _errors(model: RobotModel, log: Log, settings: SignalSettings) -> Array:
+    """Return torque prediction errors by both velocities, (n, 2); NaN with too little motion."""
+    unknown = np.full((len(model.joints), 2), np.nan)
+    if not log.has_torque or model.free_flyer or model.constraints:
+        return unknown
+    sources = [replace(settings, velocity=x) for x in ("measured", "differentiated")]
+    try:
+        motions = [process(log, chosen, friction_speeds(model.layout)) for chosen in sources]
+    except DataError:  # too short: the error is raised again when the log is read
+        return unknown
+    mask = np.all([row_mask(model, x, settings.min_velocity) for x in motions], axis=0)
+    every = -(-len(mask) // _ROWS)
+    return np.stack([_held_out_error(model, x, mask, every) for x in motions], axis=1)
+
+
+def _held_out_error(model: RobotModel, motion: Trajectory, mask: Array, every: int) -> Array:
+    """Return the norm of each torque's prediction error in the parts not fitted, shape (n,)."""
+    rows = slice(None, None, every)
+    state = motion.q[rows], motion.v[rows], motion.a[rows]
+    direction = None if motion.direction is None else motion.direction[rows]
+    Y = joint_torque_regressor(model, *state, direction)
+    Y = Y.reshape(len(state[0]), len(model.joints), -1)
+    part = np.arange(len(Y)) * _PARTS // len(Y) % 2
+    error = np.full(len(model.joints), np.nan)
+    for j, support in enumerate(model.support):
+        W, tau, used = Y[:, j, support], motion.tau[rows, j], mask[rows, j]
+        even, odd = used & (part == 0), used & (part == 1)
+        if min(even.sum(), odd.sum()) < _FEW * W.shape[1] or not tau.any():
+            continue  # too few rows, or no torques
+        squares, parts = 0.0, [(W[rows_of], tau[rows_of]) for rows_of in (even, odd)]
+        for (A, known), (B, unknown) in (parts, parts[::-1]):
+            size = np.linalg.norm(A, axis=0)
+            size[size == 0] = 1.0
+            theta = np.linalg.lstsq(A / size, known, rcond=_DEPENDENT)[0]
+            squares += float(np.sum((unknown - B @ (theta / size)) ** 2))
+        error[j] = np.sqrt(squares) + _EXACT * np.linalg.norm(tau)
+    return error
