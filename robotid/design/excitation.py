@@ -46,11 +46,7 @@ class MotionSettings(Settings):
     duration: float = setting(
         10.0, "length [s] of a fourier motion", within=_from(0.1, 3600.0, " s")
     )
-    harmonics: int = setting(
-        5,
-        "harmonics of the Fourier series",
-        within=_from(2, 100),
-    )
+    harmonics: int = setting(5, "harmonics of the Fourier series", within=_from(2, 100))
     criterion: str | None = setting(
         None,
         "optimality criterion: D (determinant of the information), A (mean variance), E (smallest "

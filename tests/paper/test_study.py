@@ -12,13 +12,7 @@ from robotid.dynamics.simulation.motions import ProgramMotion
 from robotid.paper import study
 from robotid.paper.planar_2r import PAPER_PARAMETERS
 from robotid.paper.procedure import LoopSettings, run_procedure
-from robotid.paper.study import (
-    PaperSettings,
-    energy_drift,
-    paper_arm,
-    random_runs,
-    study_model,
-)
+from robotid.paper.study import PaperSettings, energy_drift, paper_arm, random_runs, study_model
 
 
 def test_the_physical_arm_has_four_parameters_and_the_others_the_papers_five():

@@ -9,13 +9,9 @@ import pytest
 from helpers.driven import driven, driven_log, fitted_in
 from helpers.paths import URDF
 
-from robotid.data.log import Log
 from robotid.dynamics.friction_projection import drive_moments, project_friction
-from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows, open_loops
-from robotid.dynamics.simulation.simulator import RobotPlant
 from robotid.output.files.mjcf import write_mjcf
 from robotid.output.report.pictures import friction_chart
-from robotid.paper.procedure import rk4
 from robotid.robot.drive_term import Family, MemorylessTerm, Shape
 from robotid.robot.drives import FAMILIES, TERM_CLASSES, term_from_dict
 from robotid.robot.model import RobotModel
@@ -87,35 +83,3 @@ def test_a_new_term_is_identified_drawn_and_exported(bend, tmp_path):
     write_mjcf(simple.model, simple.pi, tmp_path / "robot.xml")
     (joint,) = (x for x in ET.parse(tmp_path / "robot.xml").iter("joint") if x.get("name") == JOINT)
     assert float(joint.get("damping")) == pytest.approx(drive.values["viscous"])
-
-
-def test_a_new_term_is_rolled_out_with_its_sensitivity(bend):
-    t, n = np.arange(60) / 200.0, 2
-    tau = np.tile([6.0, -2.0], (60, 1)) * np.sin(9.0 * t)[:, None]
-    log = Log(t, np.zeros((60, n)), 0 * tau, bend.true.joints, tau_ref=tau, has_torque=False)
-    pi = bend.pi.copy()
-    pi[[k for k, name in enumerate(bend.true.layout.names) if name.endswith("coulomb")]] = 0.0
-
-    def moved(size):
-        x = np.where(pi == SIZE, size, pi)
-        loops = open_loops(bend.true, x)
-        place = loops.place(0, bend.term)
-        robot = ClosedLoopRobot(bend.true, step=1e-3)
-        kind = robot.kinds["term"]
-        (out,) = robot.roll_out(loops, cut_windows(log, np.inf, 0.0), [(kind, 0, place)])
-        return out.q, out.slopes[0][2][:, :, 0]
-
-    q, slope = moved(SIZE)
-    plant = RobotPlant(bend.true, pi)
-
-    exact = [np.zeros((2, n))]
-    for u in tau[:-1]:
-        state = exact[-1]
-        for _ in range(2):
-            state = rk4(lambda q, v, u=u: plant.acceleration(q, v, u), *state, 2.5e-3)
-        exact.append(state)
-    exact = np.array(exact)[:, 0]
-    np.testing.assert_allclose(q, exact, atol=1e-3 * np.ptp(exact))
-    h = 1e-4
-    np.testing.assert_allclose(slope, (moved(SIZE + h)[0] - moved(SIZE - h)[0]) / (2 * h),
-                               atol=1e-6 * np.abs(slope).max())  # fmt: skip

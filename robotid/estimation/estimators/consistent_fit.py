@@ -589,10 +589,7 @@ def contradicted_extents(fit: Consistent, segments: Segments) -> tuple[str, ...]
 
 
 def held_out_errors(
-    fit: Consistent,
-    segments: Segments,
-    weight: float,
-    starts: Sequence[Minimum] | None = None,
+    fit: Consistent, segments: Segments, weight: float, starts: Sequence[Minimum] | None = None
 ) -> tuple[Array, list[Minimum]]:
     """Return the errors of each segment, (segments, n) [-], by the consistent fit to all others."""
     if len(segments.folds) < 2:

@@ -11,11 +11,7 @@ from helpers.synthetic import truth
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.dynamics.factors import Factors, compress, triangle_of
 from robotid.estimation.estimators import WLS, Consistent
-from robotid.estimation.estimators.consistent_fit import (
-    Constraints,
-    Subspace,
-    slabs,
-)
+from robotid.estimation.estimators.consistent_fit import Constraints, Subspace, slabs
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.interior_point import Entropic
 from robotid.estimation.fitting.chosen_estimator import make_constraints
