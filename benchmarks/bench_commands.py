@@ -46,7 +46,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, Window, open_loops
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.estimation.fitting.evaluation import evaluate_logs
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import hold_log
 from robotid.identification.closed_loop.from_commands import driven_log, identify_loops
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.loop_simulator import LoopSimulator, free_body_parameters

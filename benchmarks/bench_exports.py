@@ -76,7 +76,7 @@ def compare(name, folder):
 
 def validation_rows(name, model):
     """Return q, v, a of the validation motions where all joints move, at most ``MOST`` rows."""
-    from robotid.estimation.fitting.survey import hold_log
+    from robotid.estimation.fitting.recorded import hold_log
 
     job = read_job(JOBS / f"{name}.toml")
     rows = [hold_log(model, job.read(e, model), job.signals).whole for e in job.validation]

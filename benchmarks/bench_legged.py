@@ -50,7 +50,7 @@ from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import compress
 from robotid.dynamics.prepared_logs import base_problem
 from robotid.estimation.fitting.estimator_settings import ConsistentSettings
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import hold_log
 from robotid.identification.pipeline import identify
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf

@@ -41,11 +41,9 @@ from robotid.dynamics.simulation.motions import random_fourier
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.fit import solve_recordings
 from robotid.estimation.fitting.fitted import expected_band
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import hold_log
-from robotid.estimation.variation.draws import scores_to_values
+from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.estimation.variation.groups import Group, RunsOf, runs_of, sums_of
-from robotid.estimation.variation.spread import Runs, SpreadModel, covariance_of
+from robotid.estimation.variation.spread import Runs, SpreadModel, covariance_of, scores_to_values
 from robotid.estimation.variation.variation import SCORES, Variation, _parameters, vary
 from robotid.identification.closed_loop.loop_result import loop_runs
 from robotid.identification.pipeline import identify, with_drives

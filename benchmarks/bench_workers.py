@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
 import bench_memory
@@ -25,8 +26,7 @@ from robotid.cli.job import Job, LogEntry
 from robotid.cli.logs import survey_logs
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import join
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import ReducedPiece
+from robotid.estimation.fitting.recorded import Recordings, reduce_piece
 from robotid.estimation.work_plan import WorkPlan
 from robotid.robot.examples import example_urdf
 
@@ -89,8 +89,9 @@ def survey(path, rows_in_memory):
 
 
 def timed(plan, pieces):
+    work = partial(reduce_piece, mapping=structural_mapping(pieces[0].model))
     start = time.perf_counter()
-    whole = join(list(plan.map(ReducedPiece.reduce, pieces, "reducing")))
+    whole = join(list(plan.map(work, pieces, "reducing")))
     return time.perf_counter() - start, whole
 
 

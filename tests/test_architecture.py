@@ -164,7 +164,7 @@ def test_importing_the_package_is_light():
 def test_logs_and_results_are_handled_without_the_simulator():
     code = (
         "import sys, robotid.cli.logs, robotid.output.files.entries\n"
-        "import robotid.estimation.fitting.survey\n"
+        "import robotid.estimation.fitting.recorded\n"
         "slow = ('robotid.identification.closed_loop.stages', 'scipy.interpolate',\n"
         "        'robotid.dynamics.simulation.loops')\n"
         "print([m for m in slow if m in sys.modules])"

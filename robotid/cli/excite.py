@@ -29,7 +29,7 @@ from robotid.design.excitation import (
 from robotid.design.limits import LIMITS, Course, MotionLimits
 from robotid.design.previews import Preview, Run, preview_logs
 from robotid.design.routes import design_stands, design_sweeps
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import hold_log
 from robotid.output.report.motion_page import write_motion_page
 from robotid.robot.model import RobotModel
 

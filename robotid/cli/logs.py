@@ -23,8 +23,7 @@ from robotid.diagnosis.logs.check_logs import check_locked, diagnose, percent_hi
 from robotid.diagnosis.verdict.fit_findings import log_findings
 from robotid.diagnosis.verdict.verdict import check_ignored
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import SurveyedLog, survey_log
+from robotid.estimation.fitting.recorded import Recordings, SurveyedLog, survey_log
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.output.files.result_file import Result, load_result, stated_model, stated_parameters
 from robotid.robot.model import RobotModel

@@ -25,8 +25,7 @@ from robotid.cli.job import (
 from robotid.cli.logs import job_of_result, survey_logs
 from robotid.diagnosis.verdict.scale_check import PayloadCheck
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import SurveyedLog
+from robotid.estimation.fitting.recorded import Recordings, SurveyedLog
 from robotid.identification.payload_fit import fit_with_friction, mass_checks
 from robotid.identification.summary import cell
 from robotid.robot.bodies import usual_links

@@ -26,7 +26,7 @@ from robotid.cli.job import (
 )
 from robotid.cli.logs import fitted_hashes, result_run
 from robotid.design.previews import preview_logs
-from robotid.estimation.fitting.survey import SurveyedLog, survey_log
+from robotid.estimation.fitting.recorded import SurveyedLog, survey_log
 from robotid.output.files.entries import build_preview
 from robotid.output.files.result_file import load_result, stated_between
 from robotid.robot.model import RobotModel

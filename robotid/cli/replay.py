@@ -31,7 +31,7 @@ from robotid.design.clearance import Clearance
 from robotid.design.limits import LIMITS, Course, MotionLimits
 from robotid.dynamics.prediction import predict, predict_instants
 from robotid.dynamics.prepared_logs import closed_log
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import hold_log
 from robotid.identification.result import TorqueIdentification
 from robotid.output.files.result_file import (
     Result,

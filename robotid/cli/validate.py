@@ -38,9 +38,8 @@ from robotid.estimation.fitting.evaluation import (
     shares_rows,
 )
 from robotid.estimation.fitting.fit import sums_of_logs
-from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.recorded import Recordings, SurveyedLog
 from robotid.estimation.fitting.standard_errors import rms_error, torque_band
-from robotid.estimation.fitting.survey import SurveyedLog
 from robotid.estimation.variation.groups import RunSums, runs_of
 from robotid.estimation.variation.variation import vary
 from robotid.identification.closed_loop.position_errors import pool_positions

@@ -27,11 +27,11 @@ SOFT = 0.05
 #: Random poses by which the pairs of links that may meet are found, and postures are chosen.
 POSES = 400
 _ALMOST_ALL = 0.95  # share of the poses
-_TOUCH = 1e-3  # [m] hulls at a smaller distance touch; a flat shape has this thickness
+# [m] hulls at a smaller distance touch; thickness of a flat shape; twice the error of lower bounds
+_TOUCH = 1e-3
 _CLOSE = 5e-3  # [m] beyond the clearance: links within it are close by design
 _FIRST = 0.05  # [s] the first intervals in which a motion is checked ...
 _SHORTEST = 1e-3  # [s] ... and the shortest
-_TOLERANCE = 5e-4  # [m] by which a lower bound may be too low
 _WIDE = 100.0  # [m] extent of the floor
 _SPARE = 0.002  # [m] reserve of distances for the motion between samples ...
 _EXACT = 0.01  # [m] ... and margin below which distances are exact, but both at most ...
@@ -134,6 +134,11 @@ class Clearance:
             below = Box("the floor", (-_WIDE, -_WIDE, floor - _WIDE), (_WIDE, _WIDE, floor))
             self._hulls.append(_hull(below.name, -1, _corners(below)))
         self._request = coal.DistanceRequest(True, True)
+        self._bodies = np.array([hull.body for hull in self._hulls])
+        self._middles = np.array([hull.centre for hull in self._hulls])
+        is_below = self._tree.is_below
+        # which joints move which body, (m + 1, m), bool; the last row is at rest
+        self._supports = np.vstack([is_below, np.zeros(len(is_below), dtype=bool)])
         self.pairs = self._possible_pairs()
         self._classify(np.random.default_rng(seed))
 
@@ -182,12 +187,6 @@ class Clearance:
             f"{a} and {b} ({'overlap by ' * (d < 0)}{abs(1e3 * d):.0f} mm)"
             for (a, b), d in least.items()
         ]
-
-    @cached_property
-    def _supports(self) -> Array:
-        """Which joints move which body, shape (m + 1, m), bool; the last row is at rest."""
-        is_below = self._tree.is_below
-        return np.vstack([is_below, np.zeros(len(is_below), dtype=bool)])
 
     @cached_property
     def movers(self) -> Array:
@@ -277,7 +276,7 @@ class Clearance:
                 smallest = float(exact[k])
                 nearest = int(near.pairs[k]), float(middles[near.samples[k]])
             bound = near.distance - required - moved
-            is_open = (bound < smallest - _TOLERANCE).any(axis=0) & (2 * h > _SHORTEST)
+            is_open = (bound < smallest - _TOUCH / 2).any(axis=0) & (2 * h > _SHORTEST)
             lowest = min(lowest, float(bound[:, ~is_open].min(initial=np.inf)))
             h /= 2
             middles = np.sort(np.r_[middles[is_open] - h, middles[is_open] + h])
@@ -327,14 +326,6 @@ class Clearance:
         reach = np.abs(sides @ rotations) @ half[..., None]  # (2, k, 6, 1)
         gaps = np.abs(sides @ (centres[1] - centres[0])[..., None]) - reach.sum(axis=0)
         return np.asarray(gaps.max(axis=(1, 2), initial=-np.inf))
-
-    @cached_property
-    def _bodies(self) -> Array:
-        return np.array([hull.body for hull in self._hulls])
-
-    @cached_property
-    def _middles(self) -> Array:
-        return np.array([hull.centre for hull in self._hulls])
 
     def _poses(self, placed: Placements, hulls: Array, samples: Array) -> tuple[Array, Array]:
         """Return centres (2, k, 3) and rotations (2, k, 3, 3) of hulls (2, k) at samples (k,)."""

@@ -43,10 +43,11 @@ _ROUNDS = 14  # of the augmented Lagrangian
 _STEPS = 20  # of L-BFGS in each
 _WEIGHT = 3.0  # initial weight of the violations of all samples together
 _LESS = 0.25  # share of a round's violation: the weight increases if the next violation exceeds it
-_NEARLY = 1e-2  # change of the criterion below which the finer grid is used ...
-_SETTLED = 2e-3  # ... and below which a design has converged
+# change of the criterion below which the finer grid is used, and largest excess of a limit before a
+# converged design is scaled
+_NEARLY = 1e-2
+_SETTLED = 2e-3  # change of the criterion below which a design has converged
 _LOSS = 0.02  # largest increase of the criterion when a motion is scaled to satisfy its limits
-_OVER = 1.01  # largest use of a limit by a converged design before it is scaled
 _TRIALS = 10  # shares of a motion tried for the largest that satisfies the limits ...
 _SHARE = 1e-3  # ... to this accuracy, or as near to a limit
 _TYPICAL = 0.3  # of the largest torque, speed and acceleration: about the RMS of a motion
@@ -537,7 +538,9 @@ class Designer:
             )
         gain = state.objective - objective
         outside = self.judged(self.matrix(rows))[0]
-        is_near = np.abs(used).max() < _OVER and margin >= 0.0 and objective - outside < _LOSS
+        is_near = (
+            np.abs(used).max() < 1.0 + _NEARLY and margin >= 0.0 and objective - outside < _LOSS
+        )
         is_stalled = not is_near and gain < _LOSS  # restart from the feasible motion
         if gain < 0.0:
             feasible, objective = state.feasible, state.objective

@@ -39,18 +39,17 @@ from robotid.estimation.estimators import Estimate
 from robotid.estimation.estimators.batch import solve_factor
 from robotid.estimation.estimators.determination import base_spread, determine
 from robotid.estimation.estimators.estimator import FEWEST_SEGMENTS, scatter
-from robotid.estimation.fitting.chosen_estimator import Known, consistent_fit, pinned_links
 from robotid.estimation.fitting.estimator_settings import ConsistentSettings, EstimatorSettings
 from robotid.estimation.fitting.evaluation import evaluate_logs
+from robotid.estimation.fitting.fit import Known, consistent_fit, pinned_links
 from robotid.estimation.fitting.fitted import expected_band
-from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.recorded import Recordings, SurveyedLog, hold_log
 from robotid.estimation.fitting.standard_errors import (
     StandardErrors,
     TorqueBand,
     about_prior,
     standard_of,
 )
-from robotid.estimation.fitting.survey import SurveyedLog, hold_log
 from robotid.identification.pipeline import logs_of
 from robotid.identification.result import TorqueIdentification
 from robotid.robot.closure import refuse_loops

@@ -368,13 +368,11 @@ def base_problem(
     trajectory: Trajectory,
     weight: Array,
     *,
-    with_mass: bool = False,
     compiled: bool | None = None,
 ) -> Problem:
     """Return the problem of a trajectory in base parameters: weight (N, n_rows)."""
     rows = weight.astype(float)
-    problem = build_problem(model, trajectory, rows, with_mass=with_mass, compiled=compiled)
-    return mapping.reduce(problem)
+    return mapping.reduce(build_problem(model, trajectory, rows, compiled=compiled))
 
 
 def independent_share(signals: SignalSettings) -> float:
@@ -387,9 +385,8 @@ def independent_share(signals: SignalSettings) -> float:
 def prefers_measured(model: RobotModel, logs: Sequence[Log], settings: SignalSettings) -> bool:
     """Return whether velocity = "auto" uses the measured velocities of a log.
 
-    Measured velocities that are coarsely quantised or inconsistent with the positions are not used.
-    Others are used if they predict the torque about as well as differentiated velocities. If the
-    log has too little motion for this comparison, they are used if they are not delayed.
+    They must be fine, consistent with the positions, and predict the torque about as well as
+    differentiated ones; with too little motion for this comparison, they must not be delayed.
     """
     if any(coarse_velocities(log) or unlike_velocities(log) for log in logs):
         return False

@@ -21,8 +21,7 @@ from robotid.estimation.estimators import Consistent, Constraints, Estimate
 from robotid.estimation.estimators.estimator import quantile
 from robotid.estimation.estimators.two_runs import Compared, TwoRuns, payload_runs
 from robotid.estimation.fitting.estimator_settings import ConsistentSettings
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.identification.pipeline import logs_of, robot_of, with_drives
 from robotid.robot.bodies import link_transfer, usual_links
 from robotid.robot.closure import refuse_loops

@@ -47,8 +47,7 @@ from robotid.estimation.fitting.drive_terms import DriveChoice
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.fit import fit_recordings, rough_choice, solve_recordings
 from robotid.estimation.fitting.fitted import Fit, Solution
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.estimation.variation.variation import vary
 from robotid.identification.repeated_errors import with_repeated_errors
 from robotid.identification.result import StatedSettings, TorqueIdentification

@@ -39,8 +39,7 @@ from robotid.dynamics.factors import Triangle, join, triangle_of
 from robotid.dynamics.prediction import predict
 from robotid.dynamics.prepared_logs import base_problem
 from robotid.estimation.estimators import WLS
-from robotid.estimation.fitting.recorded import Recordings, RepeatedErrors
-from robotid.estimation.fitting.survey import Rows, SurveyedLog
+from robotid.estimation.fitting.recorded import Recordings, RepeatedErrors, Rows, SurveyedLog
 from robotid.robot.constraints import Contact
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread

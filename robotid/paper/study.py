@@ -11,7 +11,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
@@ -46,9 +45,8 @@ AMPLITUDE = (1.0, 1.5)  # [rad] of the program motion
 DURATION = 2.0  # [s]
 PROGRAM = ProgramMotion(np.array(AMPLITUDE), DURATION)
 _START = (np.pi / 180, 0.0)  # [rad] start of the robot relative to its program
-_EPS1 = 1e-9  # [N m / s^2] PRX below it is zero
-TOLERANCE = 1e-3  # [-] relative error at which a run has converged
-_STALLED = 1e-3  # [-] smallest relative decrease of the error over ten iterations
+#: Relative error at which a run has converged; a smaller decrease over ten iterations is none [-].
+TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -136,13 +134,13 @@ def study_model(
         PROGRAM,
         np.tile(P / 2, (len(cases), 1)),
         settings=LoopSettings(
-            iterations=settings.iterations, eps1=_EPS1, eps2=np.array([c.eps2 for c in cases])
+            iterations=settings.iterations, eps2=np.array([case.eps2 for case in cases])
         ),
         offset=np.array([case.offset for case in cases]),
         influences=_influences(cases, np.random.default_rng(settings.seed)),
         progress=progress,
     )
-    endless = LoopSettings(iterations=settings.longest, eps1=_EPS1)
+    endless = LoopSettings(iterations=settings.longest)
     once = LoopSettings(iterations=1, method="one_shot")
     further, single = (
         run_procedure(dynamics, plant, PROGRAM, P[None] / 2, settings=s, offset=np.array(_START))
@@ -170,39 +168,25 @@ class RandomRuns:
     errors: Array  # (L + 1, R), relative error before the first iteration and after each
     history: History  # the course of the runs
 
-    @property
-    def has_converged(self) -> NDArray[np.bool_]:
-        """Whether each run reached ``TOLERANCE``, shape (R,)."""
-        return np.asarray((self.errors < TOLERANCE).any(axis=0))
-
-    @property
-    def iterations(self) -> list[int]:
-        """Number of iterations of each converged run."""
-        first = (self.errors < TOLERANCE).argmax(axis=0)
-        return [int(k) for k in first[self.has_converged]]
-
-    @property
-    def failures(self) -> list[dict[str, Any]]:
-        """Each run without convergence: its number, the reason, the final error, its settings."""
-        return [
-            {
-                "run": r,
-                "reason": self._reason(r),
-                "relative_error": float(self.errors[-1, r]),
-                **{key: values[r].tolist() for key, values in self.drawn.items()},
-            }
-            for r in np.flatnonzero(~self.has_converged).tolist()
-        ]
-
     def to_dict(self) -> dict[str, Any]:
         """Return the part of paper.json."""
+        reached = self.errors < TOLERANCE  # (L + 1, R)
+        has_converged = np.asarray(reached.any(axis=0))
         return {
-            "runs": len(self.has_converged),
-            "converged": int(self.has_converged.sum()),
+            "runs": len(has_converged),
+            "converged": int(has_converged.sum()),
             "tolerance": TOLERANCE,
             "most_iterations": len(self.errors) - 1,
-            "iterations": self.iterations,
-            "failures": self.failures,
+            "iterations": reached.argmax(axis=0)[has_converged].tolist(),
+            "failures": [
+                {
+                    "run": r,
+                    "reason": self._reason(r),
+                    "relative_error": float(self.errors[-1, r]),
+                    **{key: values[r].tolist() for key, values in self.drawn.items()},
+                }
+                for r in np.flatnonzero(~has_converged).tolist()
+            ],
         }
 
     def _reason(self, r: int) -> str:
@@ -255,7 +239,7 @@ def _course(error: Array) -> str:
     decrease = 1.0 - error[-1] / error[count - last]
     if error[-1] > error[0]:
         return f"the error increased: from {error[0]:.2g} to {error[-1]:.2g}"
-    if decrease < _STALLED:
+    if decrease < TOLERANCE:
         return f"stalled: the motion excites too little; the error is {error[-1]:.2g}"
     return (
         f"slow: the error is {error[-1]:.2g} after {count} iterations, with a decrease of "

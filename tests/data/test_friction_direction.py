@@ -9,7 +9,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import _acting, acting_directions, process
 from robotid.dynamics.rows import friction_speeds
 from robotid.dynamics.torque import build_problem, joint_torque_regressor
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import hold_log
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling

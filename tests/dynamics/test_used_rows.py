@@ -10,7 +10,7 @@ from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import resolve
 from robotid.dynamics.prepared_logs import independent_share, static_rows
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import hold_log
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

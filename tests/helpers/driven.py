@@ -12,8 +12,7 @@ from robotid.dynamics.simulation.simulation_settings import Sensors
 from robotid.dynamics.simulation.simulator import Noise
 from robotid.dynamics.simulation.truth import another_robot
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.identification.pipeline import identify, with_drives
 from robotid.robot.drives import AUTO, wanted_families
 from robotid.robot.examples import example_urdf

@@ -11,8 +11,7 @@ import robotid
 from robotid.data.base_motion import BaseMotion
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.estimators import WLS
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.identification.repeated_errors import with_repeated_errors
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf

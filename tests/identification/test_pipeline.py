@@ -12,8 +12,7 @@ from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.identification.pipeline import conclude
 from robotid.robot.model import RobotModel
 

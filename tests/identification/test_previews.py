@@ -28,7 +28,7 @@ from robotid.dynamics.prepared_logs import base_problem
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.torque import joint_torque_regressor, trajectory_regressor
 from robotid.estimation.estimators.estimator import scatter
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import hold_log
 from robotid.output.files.entries import build_preview
 
 STD = np.array([2.0, 3.0, 1.0, 0.3, 0.2, 0.1])  # [N m]

@@ -13,8 +13,7 @@ from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.constraint_rows import constraint_jacobian, touching
 from robotid.dynamics.prediction import predict
 from robotid.dynamics.prepared_logs import base_problem
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.identification.repeated_errors import (
     _shift,
     _shift_of_motion,

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from itertools import chain
 from operator import attrgetter
 from typing import Any
 
@@ -72,40 +73,34 @@ class DriveChoice:
         }
 
     def moved(self, step: Array, covariance: Array) -> "DriveChoice":
-        """Return the choice with shapes changed by a step, within their bounds.
+        """Return the choice with shapes changed by a step (k,), within their bounds.
 
-        No shape changes by more than a third.
-
-        step (k,), covariance (k, k).
+        No shape changes by more than a third; the covariance of the shapes (k, k) is stated.
         """
-        flat = np.array([size for own in self.sizes for size in own])
+        flat = np.array(list(chain.from_iterable(self.sizes)))
         families = [FAMILIES[name] for name in self.families]
         bounds = np.array([s.within(self.data_range) for family in families for s in family.shapes])
         near = np.clip(flat + step, flat / _FARTHEST, flat * _FARTHEST)
         sizes = np.clip(near, *bounds.T)
         chosen = with_shapes(families, sizes)
-        shapes = zip(self.shapes, sizes, np.sqrt(np.diag(covariance)), strict=True)
+        shapes = zip(self.shapes, sizes.tolist(), np.sqrt(np.diag(covariance)), strict=True)
         return replace(
             self,
-            terms=tuple(t for family, own in chosen for t in family.make(self.data_range, *own)),
-            shapes=tuple(
-                replace(shape, value=float(size), std_error=float(error))
-                for shape, size, error in shapes
-            ),
+            terms=self._terms_of(chosen),
+            shapes=tuple(replace(x, value=size, std_error=float(e)) for x, size, e in shapes),
             shape_covariance=tuple(tuple(row) for row in covariance.tolist()),
-            sizes=tuple(tuple(own) for _, own in chosen),
+            sizes=tuple(tuple(of_family) for _, of_family in chosen),
         )
 
     def altered(self, which: int, share: float) -> tuple[DriveTerm, ...]:
         """Return the terms with one of the shapes increased."""
-        flat = [(at, k) for at, own in enumerate(self.sizes) for k in range(len(own))]
-        sizes = [list(own) for own in self.sizes]
-        at, k = flat[which]
-        sizes[at][k] *= 1.0 + share
-        every = zip(self.families, sizes, strict=True)
-        return tuple(
-            term for name, own in every for term in FAMILIES[name].make(self.data_range, *own)
-        )
+        flat = np.array(list(chain.from_iterable(self.sizes)))
+        flat[which] *= 1.0 + share
+        return self._terms_of(with_shapes([FAMILIES[name] for name in self.families], flat))
+
+    def _terms_of(self, chosen: Sequence[tuple[Family, list[float]]]) -> tuple[DriveTerm, ...]:
+        made = (family.make(self.data_range, *sizes) for family, sizes in chosen)
+        return tuple(chain.from_iterable(made))
 
 
 def with_shapes(families: Sequence[Family], flat: Array) -> list[tuple[Family, list[float]]]:
@@ -127,28 +122,20 @@ class JointMotion:
     time: Array  # (N,), time since the start of the recording, over the longest duration [-]
     passes: float = np.inf  # cut-off frequency of the torque filter [Hz]; infinite without a filter
     longest: float = 1.0  # the longest duration of a recording [s]
-    #: Motion of the joints before and after it, by name.
-    others: dict[str, "JointMotion"] = field(default_factory=dict)
-    #: Motion whose typical speeds, distances and loads scale columns; None: this one.
-    scale: "JointMotion | None" = None
+    others: dict[str, "JointMotion"] = field(default_factory=dict)  # the joints before and after it
+    scale: "JointMotion | None" = None  # motion whose typical values scale columns; None: this one
 
     @classmethod
     def steady(cls, motion: DriveMotion) -> "JointMotion":
-        """Return the motion of a joint after long motion at constant speed, the others at rest.
-
-        motion (N,).
-        """
-        none, far = np.zeros_like(motion.v), np.full_like(motion.v, np.inf)
-        m = motion
+        """Return the motion of a joint after long motion at constant speed, the others at rest."""
+        none, far, m = np.zeros_like(motion.v), np.full_like(motion.v, np.inf), motion
         return cls(m.q, m.v, m.a, m.direction, m.load, travelled=far, time=none)
 
     def at(self, rows: slice) -> "JointMotion":
         """Return the motion in some of the rows, without the other joints."""
-        q, v, a, direction, load = (
-            x[rows] for x in (self.q, self.v, self.a, self.direction, self.load)
-        )
-        travelled, time = self.travelled[rows], self.time[rows]
-        return JointMotion(q, v, a, direction, load, travelled, time, self.passes, self.longest)
+        names = ("q", "v", "a", "direction", "load", "travelled", "time")
+        some: dict[str, Any] = {name: getattr(self, name)[rows] for name in names}
+        return replace(self, **some, others={}, scale=None)
 
 
 def joint_motions(
@@ -156,48 +143,44 @@ def joint_motions(
 ) -> tuple[JointMotion, ...]:
     """Return the motion of each joint and its neighbours in some rows of recordings.
 
-    load (N, n) [N m or N].
+    load (N, n) [N m or N] over these rows of all recordings.
     """
     motions = [recording.trajectory for recording in recordings]
     passes = max(recording.signals.cutoff or np.inf for recording in recordings)
-    longest = max(float(np.ptp(m.t)) for m in motions)
+    longest = max(float(np.ptp(m.t)) for m in motions) or 1.0
+    n = len(model.joints)  # the pose and twist of a floating base come before them
 
     def joined(of: Callable[[Trajectory], Array]) -> Array:
         return np.concatenate([of(m)[k] for m, k in zip(motions, rows, strict=True)])
 
-    n = len(model.joints)  # the pose and twist of a floating base come before them
-    q, v, a = (x[:, x.shape[1] - n :] for x in (joined(attrgetter(name)) for name in "qva"))
-    signs = joined(partial(_directions, model))
-    distance = joined(travelled)
-    time = joined(lambda m: (m.t - m.t[0]) / (longest or 1.0))
+    q, v, a = (joined(attrgetter(name))[:, -n:] for name in "qva")
+    signs, distance = joined(partial(_directions, model)), joined(travelled)
+    time = joined(lambda m: (m.t - m.t[0]) / longest)
     columns = zip(q.T, v.T, a.T, signs.T, load.T, distance.T, strict=True)
     alone = [
-        JointMotion(q_j, v_j, a_j, sign, load_j, far, time, passes, longest or 1.0)
+        JointMotion(q_j, v_j, a_j, sign, load_j, far, time, passes, longest)
         for q_j, v_j, a_j, sign, load_j, far in columns
     ]
-    neighbours = [[k for k in (j - 1, j + 1) if 0 <= k < len(alone)] for j in range(len(alone))]
     return tuple(
-        replace(motion, others={model.joints[k]: alone[k] for k in near})
-        for motion, near in zip(alone, neighbours, strict=True)
+        replace(motion, others={model.joints[k]: alone[k] for k in (j - 1, j + 1) if 0 <= k < n})
+        for j, motion in enumerate(alone)
     )
 
 
 def _directions(model: RobotModel, motion: Trajectory) -> Array:
     """Return the direction of the friction of each joint's own drive, shape (N, n)."""
-    signs = friction_directions(model.layout, motion.v, motion.direction)[:, : len(model.joints)]
-    v = motion.v[:, motion.v.shape[1] - len(model.joints) :]
-    return signs if signs.shape[1] else np.sign(v)
+    n = len(model.joints)
+    signs = friction_directions(model.layout, motion.v, motion.direction)[:, :n]
+    return signs if signs.shape[1] else np.sign(motion.v[:, -n:])
 
 
 def travelled(motion: Trajectory) -> Array:
     """Return the distance of each joint since its last reversal, shape (N, n) [rad or m]."""
     is_first = np.diff(motion.segment, prepend=motion.segment[0] - 1) != 0
-    n = len(motion.joints)
-    q, v = (x[:, x.shape[1] - n :] for x in (motion.q, motion.v))
+    q, v = (x[:, -len(motion.joints) :] for x in (motion.q, motion.v))
     reverses = (np.diff(np.sign(v), axis=0, prepend=0.0) != 0) | is_first[:, None]
     last = np.maximum.accumulate(np.where(reverses, np.arange(len(reverses))[:, None], 0), axis=0)
-    distance: Array = np.abs(q - np.take_along_axis(q, last, axis=0))
-    return distance
+    return np.asarray(np.abs(q - np.take_along_axis(q, last, axis=0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,11 +196,9 @@ class OpenTerm:
 def open_torques(
     model: RobotModel, terms: Sequence[OpenTerm], recording: Recording, rows: Array
 ) -> list[Array]:
-    """Return the torque of each open term of the drives along a recording.
+    """Return the torque (k, n_rows) of each open term of the drives in rows (k,) of a recording.
 
     The model has the identified bodies as its reference.
-
-    rows (k,) -> (k, n_rows) [N m or N].
     """
     if not terms:
         return []

@@ -72,7 +72,6 @@ def _interval(value: object, what: str) -> tuple[float, float]:
     if not (isinstance(pair, Sequence) and len(pair) == 2 and all(map(_is_number, pair))):
         raise SettingsError(f"{what} is {value!r}, wanted a number or [smallest, largest] [kg]")
     low, high = (math.inf if abs(x) > _LARGEST else float(x) for x in pair)
-    found = f"{what} is [{low:g}, {high:g}] kg"
     if not (math.isfinite(low) and math.isfinite(high)):
         raise SettingsError(
             f"{what} is {value!r}, wanted finite numbers of at most {_LARGEST:g} kg; write "
@@ -80,7 +79,8 @@ def _interval(value: object, what: str) -> tuple[float, float]:
         )
     if not low <= high:
         raise SettingsError(
-            f"{found}: the first value is larger than the second; write the smaller one first"
+            f"{what} is [{low:g}, {high:g}] kg: the first value is larger than the second; write "
+            "the smaller one first"
         )
     return low, high
 
@@ -132,11 +132,11 @@ class EstimatorSettings(Settings):
             return super().__new__(cls)
         if kind is None:
             raise SettingsError(f"estimator is {name!r}, wanted one of {listed(ESTIMATORS)}")
-        own = [f.name for f in fields(kind) if f.name != "name"]
-        own.sort(key=lambda key: key not in kind.__annotations__)
+        keys = [f.name for f in fields(kind) if f.name != "name"]
+        keys.sort(key=lambda key: key not in kind.__annotations__)
         for key in options:
-            if key not in own:
-                had = listed(own)
+            if key not in keys:
+                had = listed(keys)
                 raise SettingsError(f"estimator {name!r} has no setting {key!r}; it has {had}")
         return super().__new__(kind)
 
@@ -203,7 +203,7 @@ class BoundedSettings(EstimatorSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_kind(self.constraints, Mapping, "constraints", "a table of bounds")
-        known = [each.name for each in fields(ConstraintSettings)]
+        known = [f.name for f in fields(ConstraintSettings)]
         if strange := [key for key in self.constraints if key not in known]:
             raise SettingsError(
                 f"constraints has the key {strange[0]!r}, wanted keys of {listed(known)}"
@@ -297,11 +297,6 @@ class PRXSettings(RecursiveSettings):
     """Settings of the paper's update law."""
 
     name: str = _called("prx", "gradient steps along PRX (the paper's update), sample by sample")
-    step: str = setting(
-        "exact",
-        "step length: exact (line search) or printed (as in the paper)",
-        among=("exact", "printed"),
-    )
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
-from itertools import chain
+from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,7 +17,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import turns_note
 from robotid.dynamics.factors import Factors, merge
 from robotid.dynamics.prediction import predict
-from robotid.estimation.fitting.survey import PieceTask, SurveyedLog
+from robotid.estimation.fitting.recorded import LogPiece, SurveyedLog
 from robotid.estimation.work_plan import WorkPlan
 from robotid.robot.model import RobotModel
 
@@ -45,6 +45,12 @@ class JointMetrics:
     baselines: Mapping[str, float | None]  # relative_error_pct of other predictions, by name [%]
     better_than_constant: bool  # whether the residual is smaller than that of the mean
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the metrics as they are written to result.json."""
+        content = dict(vars(self))
+        baselines = content.pop("baselines").items()
+        return content | {f"{name}_relative_error_pct": error for name, error in baselines}
+
 
 @dataclass(frozen=True)
 class Metrics:
@@ -56,21 +62,8 @@ class Metrics:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as they are written to result.json."""
-        return {
-            "per_joint": {
-                joint: {
-                    "rmse": m.rmse,
-                    "unit": m.unit,
-                    "relative_error_pct": m.relative_error_pct,
-                    "r2": m.r2,
-                    "rows": m.rows,
-                    **{f"{x}_relative_error_pct": error for x, error in m.baselines.items()},
-                    "better_than_constant": m.better_than_constant,
-                }
-                for joint, m in self.per_joint.items()
-            },
-            "pooled_rmse": self.pooled_rmse,
-        }
+        per_joint = {joint: m.to_dict() for joint, m in self.per_joint.items()}
+        return {"per_joint": per_joint, "pooled_rmse": self.pooled_rmse}
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,10 +82,7 @@ class TorqueSums:
     def of(
         cls, tau: Array, prediction: Array, mask: Array, baselines: Mapping[str, Array]
     ) -> "TorqueSums":
-        """Return the sums over the rows used.
-
-        tau (N, n) [N m, N], prediction (N, n) [N m, N], mask (N, n), baselines (N, n).
-        """
+        """Return the sums over the rows used; all arguments (N, n)."""
         rows = mask.sum(axis=0)
         mean = np.sum(tau, axis=0, where=mask) / np.maximum(rows, 1)
 
@@ -191,20 +181,16 @@ class Evaluated(Protocol):
     """A recording with predictions and their errors: of torques, or of simulated positions."""
 
     @property
-    def log(self) -> Log:
-        """The log, or its first rows."""
+    def log(self) -> Log: ...  # the log, or its first rows
 
     @property
-    def extent(self) -> Extent:
-        """Size of the whole log."""
+    def extent(self) -> Extent: ...  # of the whole log
 
     @property
-    def metrics(self) -> Mapping[str, Metrics]:
-        """Metrics over the whole log, by name of the parameters; they state the unit."""
+    def metrics(self) -> Mapping[str, Metrics]: ...  # over the whole log, by name of the parameters
 
     @property
-    def name(self) -> str:
-        """Name of the log's file and its time range, as ``run3.parquet 5-7.4 s``."""
+    def name(self) -> str: ...  # name of the log's file and its time range
 
     def to_dict(self, name: str = "estimate") -> dict[str, Any]:
         """Return the log and its metrics as plain values, as result.json has them."""
@@ -250,16 +236,22 @@ def evaluate_logs(
     *,
     plan: WorkPlan | None = None,
 ) -> tuple[tuple[Evaluation, ...], tuple[Evaluation, ...]]:
-    """Return the torques that parameters predict for logs, and their metrics.
+    """Return the torques that parameters (p,) predict for logs, and their metrics.
 
-    parameters (p,), prior (p,), driven (p,).
+    The parameters of the URDF, ``prior``, and with fitted drives, ``driven``, are the baselines.
     """
     work = partial(_score, parameters=parameters, prior=prior, driven=driven)
-    other = _score_logs(validation, work, plan)
-    sought = [score.sampled for score in other]
-    own = _score_logs(fitted, partial(work, sought=sought), plan)
-    again = [any(_is_shared(score.found[k]) for score in own) for k in range(len(other))]
-    return tuple(map(_conclude, fitted, own)), tuple(map(_conclude, validation, other, again))
+    new = _score_logs(validation, work, plan)
+    sought = [np.concatenate([score.sampled for score in scores]) for scores in new]
+    old = _score_logs(fitted, partial(work, sought=sought), plan)
+    is_refitted = [
+        any(_is_shared(np.any([score.found[k] for score in scores], axis=0)) for scores in old)
+        for k in range(len(new))
+    ]
+    return (
+        tuple(map(_evaluation_of, fitted, old)),
+        tuple(map(_evaluation_of, validation, new, is_refitted)),
+    )
 
 
 def shares_rows(one: Log, other: Log) -> bool:
@@ -292,102 +284,69 @@ def hidden_joints(model: RobotModel, evaluations: Sequence[Evaluation]) -> tuple
     return hidden if len(hidden) < len(metrics) else ()
 
 
-_Shown = tuple[Trajectory, Array, Mapping[str, Array]]  # motion, rows used, torques
-
-
 @dataclass(frozen=True, eq=False)
 class _Score:
-    """Result of a log, or of its pieces so far."""
+    """Result of a piece of a log."""
 
     sums: Mapping[str, TorqueSums]  # from which the metrics are computed, by parameters
     smooth: int  # samples
     used: int  # torque rows used
     segments: frozenset[int]  # numbers of the segments that have samples
     turned: Array  # (n,), bool: joints whose position was unwrapped
-    shown: tuple[_Shown, ...]  # all samples, or a few segments
+    shown: tuple[Trajectory, Array, Mapping[str, Array]] | None  # motion, rows used, torques
     sampled: Array  # (m, 2 n), recorded rows spread over the log
     found: tuple[Array, ...]  # which of the sampled rows of each other log are in this one
-
-    def join(self, other: "_Score") -> "_Score":
-        """Return the result together with that of the following pieces."""
-        return _Score(
-            sums={name: x.merge(other.sums[name]) for name, x in self.sums.items()},
-            smooth=self.smooth + other.smooth,
-            used=self.used + other.used,
-            segments=self.segments | other.segments,
-            turned=self.turned | other.turned,
-            shown=self.shown + other.shown,
-            sampled=np.concatenate([self.sampled, other.sampled]),
-            found=tuple(one | two for one, two in zip(self.found, other.found, strict=True)),
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class _Part(PieceTask):
-    """A piece, with the rows of it that are stored: sampled rows, and a segment for plots."""
-
-    sampled: slice
-    shown: slice | None
-
-
-def _parts(log: SurveyedLog) -> list[_Part]:
-    last = len(log.pieces) - 1
-    shown = {0: slice(_SHOWN), (last + 1) // 2: slice(_SHOWN), last: slice(-_SHOWN, None)}
-    if log.is_in_memory:
-        shown = {0: slice(None)}
-    every = _sampled_every(log.stop - log.first)
-    return [
-        _Part(piece, slice((log.first - piece.first) % every, None, every), shown.get(k))
-        for k, piece in enumerate(log.pieces)
-    ]
 
 
 def _score_logs(
     logs: Sequence[SurveyedLog], work: "partial[_Score]", plan: WorkPlan | None
-) -> list[_Score]:
-    """Return the result of each log; raise an error for a log without samples."""
-    parts = [_parts(log) for log in logs]
-    every = list(chain.from_iterable(parts))
-    found = (work(x, None) for x in every) if plan is None else plan.map(work, every, "evaluating")
+) -> list[list[_Score]]:
+    """Return the results of the pieces of each log; raise an error for a log without samples."""
+    pieces = [piece for log in logs for piece in log.pieces]
+    results = (
+        (work(x, None) for x in pieces) if plan is None else plan.map(work, pieces, "evaluating")
+    )
     scores = []
-    for log, own in zip(logs, parts, strict=True):
-        by_piece = [next(found) for _ in own]
-        score = reduce(_Score.join, by_piece)
-        if not score.smooth:
+    for log in logs:
+        by_piece = list(islice(results, len(log.pieces)))
+        filled = [k for k, score in enumerate(by_piece) if score.smooth]
+        if not filled:
             raise log.too_short()
-        if not score.shown:  # the chosen pieces have no samples: choose another piece
-            filled = next(k for k, piece in enumerate(by_piece) if piece.smooth)
-            again = work(replace(own[filled], shown=slice(_SHOWN)), None)
-            score = replace(score, shown=again.shown)
-        scores.append(score)
+        if not any(score.shown for score in by_piece):  # the chosen pieces have no samples
+            k = filled[0]
+            by_piece[k] = work(log.pieces[k], None, shown_rows=slice(_SHOWN))
+        scores.append(by_piece)
     return scores
 
 
 def _score(
-    whole: _Part,
+    piece: LogPiece,
     threads: int | None,
     *,
     parameters: Mapping[str, Array],
     prior: Array | None,
     driven: Array | None,
     sought: Sequence[Array] = (),
+    shown_rows: slice | None = None,
 ) -> _Score:
-    """Return the result of a piece, with the torques of a part of it."""
-    header, rows = whole.piece.header, whole.piece.read()
-    model, motion, mask = header.model, rows.trajectory, rows.mask
+    """Return the result of a piece, with the torques of the rows that are shown."""
+    rows, model = piece.read(), piece.model
+    motion, mask = rows.trajectory, rows.mask
     of_urdf = {"urdf": prior, "urdf_with_drives": driven}
     moving = {name: pi for name, pi in of_urdf.items() if pi is not None}
-    torques = _predict_all(model, motion, {**parameters, **moving}, prior, header.is_compiled)
+    torques = _predict_all(model, motion, {**parameters, **moving}, prior, piece.is_compiled)
     baselines = {x: torques[x] for x in ("gravity_only", *moving) if x in torques}
-    shown: tuple[_Shown, ...] = ()
-    if whole.shown is not None and len(motion.t):
-        start, stop, _ = whole.shown.indices(len(motion.t))
+    shown, shown_rows = None, shown_rows or _shown_rows(piece)
+    if shown_rows is not None and len(motion.t):
+        start, stop, _ = shown_rows.indices(len(motion.t))
         stored = {name: torque[start:stop] for name, torque in torques.items()}
         # the whole motion is used as it is, with its cached properties
-        part = motion if stop - start == len(motion.t) else motion.at(slice(start, stop))
-        shown = ((part, mask[start:stop], stored),)
+        is_whole = stop - start == len(motion.t)
+        shown = motion if is_whole else motion.at(slice(start, stop)), mask[start:stop], stored
     recorded = np.hstack([rows.positions, rows.torques])
     measured = mask & [name not in model.passive for name in model.row_names]
+    first, stop = piece.log_rows
+    every = _sampled_every(stop - first)
     return _Score(
         sums={x: TorqueSums.of(motion.tau, torques[x], measured, baselines) for x in parameters},
         smooth=len(motion.t),
@@ -395,9 +354,19 @@ def _score(
         segments=frozenset(np.unique(motion.segment).tolist()),
         turned=rows.turned,
         shown=shown,
-        sampled=recorded[whole.sampled],
+        sampled=recorded[(first - piece.first) % every :: every],
         found=tuple(_rows_in(sampled, recorded) for sampled in sought),
     )
+
+
+def _shown_rows(piece: LogPiece) -> slice | None:
+    """Return the samples for plots: all in memory, else some of first, middle and last piece."""
+    k, count = piece.number
+    if isinstance(piece.source, Log):
+        return slice(None)
+    if k == count - 1:
+        return slice(-_SHOWN, None)
+    return slice(_SHOWN) if k in (0, count // 2) else None
 
 
 def _predict_all(
@@ -420,25 +389,30 @@ def _predict_all(
     return dict(zip(names, torques, strict=True))
 
 
-def _conclude(log: SurveyedLog, score: _Score, is_refitted: bool = False) -> Evaluation:
-    """Return the evaluation of a log."""
-    motions, masks, torques = zip(*score.shown, strict=True)
+def _evaluation_of(
+    log: SurveyedLog, scores: Sequence[_Score], is_refitted: bool = False
+) -> Evaluation:
+    """Return the evaluation of a log from the results of its pieces."""
+    shown = [score.shown for score in scores if score.shown is not None]
+    motions, masks, torques = zip(*shown, strict=True)
     extent = Extent(
         samples=log.stop - log.first,
         rate=1.0 / log.step,
         start=float(log.stamps[log.first]),
         end=float(log.stamps[log.stop - 1]),
-        smooth=score.smooth,
-        rows_used=score.used,
-        segments=len(score.segments),
+        smooth=sum(score.smooth for score in scores),
+        rows_used=sum(score.used for score in scores),
+        segments=len(frozenset.union(*(score.segments for score in scores))),
     )
-    head, model, sums = log.head, log.model, score.sums
-    names = [head.joints[j] for j in np.flatnonzero(score.turned)]
-    if names:
-        head = replace(head, notes=(*head.notes, turns_note(names)))
+    head, model = log.head, log.model
+    turned = np.any([score.turned for score in scores], axis=0)
+    if turned.any():
+        note = turns_note([head.joints[j] for j in np.flatnonzero(turned)])
+        head = replace(head, notes=(*head.notes, note))
     recording = Recording(head, log.signals, _joined(motions), np.concatenate(masks), extent)
     predicted = {name: np.concatenate([t[name] for t in torques]) for name in torques[0]}
-    metrics = {name: s.metrics(model.row_names, model.row_units) for name, s in sums.items()}
+    sums = {x: reduce(TorqueSums.merge, [s.sums[x] for s in scores]) for x in scores[0].sums}
+    metrics = {x: total.metrics(model.row_names, model.row_units) for x, total in sums.items()}
     return Evaluation(recording, predicted, sums, metrics, is_refitted)
 
 
@@ -465,16 +439,16 @@ def _sampled_every(rows: int) -> int:
 
 def _rows_in(sampled: Array, rows: Array) -> Array:
     """Return which sampled rows (m, 2 n) of positions and torques are among rows, shape (m,)."""
-    found = np.isin(sampled[:, 0], rows[:, 0])
-    likely = rows[np.isin(rows[:, 0], sampled[found, 0])]
-    for k in np.flatnonzero(found):
-        found[k] = (likely == sampled[k]).all(axis=1).any()
-    return found
+    is_in = np.isin(sampled[:, 0], rows[:, 0])
+    likely = rows[np.isin(rows[:, 0], sampled[is_in, 0])]
+    for k in np.flatnonzero(is_in):
+        is_in[k] = (likely == sampled[k]).all(axis=1).any()
+    return is_in
 
 
-def _is_shared(found: Array) -> bool:
-    """Return whether enough rows were found in another log to call it the same recording."""
-    return int(found.sum()) > max(1, _SHARED * len(found))
+def _is_shared(is_in: Array) -> bool:
+    """Return whether enough sampled rows are in another log to call it the same recording."""
+    return int(is_in.sum()) > max(1, _SHARED * len(is_in))
 
 
 def left_out_metrics(
@@ -485,16 +459,15 @@ def left_out_metrics(
 ) -> dict[str, Metrics]:
     """Return the metrics of each log as a fit to the others predicts it, by its name.
 
-    Logs that repeat the motion of one another are left out together.
-
-    fit (p,).
+    Logs that repeat the motion of one another are left out together. A fit returns the parameters
+    (p,), and those of the URDF with drives.
     """
     if any(e.recording.is_partial for e in fitted):
         return {}
     motions = alike_motions([e.recording.trajectory for e in fitted])
     if len(motions) < FEWEST_LEFT_OUT:
         return {}
-    found = {}
+    metrics = {}
     for first in range(min(_FITS, len(motions))):
         out = {k for motion in motions[first::_FITS] for k in motion}
         others = merge([part for k, log in enumerate(logs) if k not in out for part in log])
@@ -503,15 +476,14 @@ def left_out_metrics(
         except RankDeficientError:  # of "ols" and "wls": not evaluated, which the verdict states
             continue
         for k in sorted(out):
-            motion, mask = fitted[k].recording.trajectory, fitted[k].recording.mask
+            recording, torques = fitted[k].recording, fitted[k].torques
+            motion = recording.trajectory
             torque, by_urdf = predict(model, [pi, driven], motion)
-            torques = fitted[k].torques
-            plain = {x: torques[x] for x in ("gravity_only", "urdf") if x in torques}
-            plain["urdf_with_drives"] = by_urdf
-            sums = TorqueSums.of(motion.tau, torque, mask, plain)
-            name = f"{fitted[k].recording.name}{LEFT_OUT}"
-            found[name] = sums.metrics(model.row_names, model.row_units)
-    return found
+            baselines = {x: torques[x] for x in ("gravity_only", "urdf") if x in torques}
+            baselines["urdf_with_drives"] = by_urdf
+            sums = TorqueSums.of(motion.tau, torque, recording.mask, baselines)
+            metrics[recording.name + LEFT_OUT] = sums.metrics(model.row_names, model.row_units)
+    return metrics
 
 
 def logs_that_test(names: Collection[str]) -> str:

@@ -1,28 +1,38 @@
-"""Fit of a robot's parameters to recordings: estimate, standard errors, predictions."""
+"""Fit of a robot's parameters to recordings: estimate, standard errors, predictions.
 
-from collections.abc import Sequence
+The flow: rows of the recordings are reduced to factors (``_ground``), the estimator solves them
+(``_run``), and the scatter of the factors of segments gives the standard errors (``Solved``).
+"""
+
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from robotid.base.exceptions import NotConvergedError, RankDeficientError, SettingsError
 from robotid.base.typing import Array
 from robotid.dynamics.base_parameters import BaseMapping
-from robotid.dynamics.factors import Factors, Reduction, join
+from robotid.dynamics.factors import Factors, Reduction, gather, join
 from robotid.dynamics.prediction import body_slopes_by_position, is_loaded
-from robotid.estimation.estimators import WLS, Consistent, Estimate
+from robotid.estimation import estimators
+from robotid.estimation.estimators import WLS, Consistent, Constraints, Estimate
+from robotid.estimation.estimators.consistent_fit import (
+    AS_GOOD,
+    Segments,
+    choose_weight,
+    contradicted_extents,
+    loss_of,
+)
 from robotid.estimation.estimators.determination import Determination, base_spread, determine
 from robotid.estimation.estimators.estimator import Weighing
-from robotid.estimation.fitting.chosen_estimator import (
-    Known,
-    consistent_fit,
-    make_estimator,
-    pinned_links,
-)
+from robotid.estimation.fitting import estimator_settings as settings
 from robotid.estimation.fitting.estimator_settings import (
     BoundedSettings,
+    ConstraintSettings,
     EstimatorSettings,
     RecursiveSettings,
 )
@@ -51,20 +61,139 @@ from robotid.estimation.variation.groups import (
     sums_of,
     with_zeros,
 )
+from robotid.robot.bodies import held_parameters, negligible_bodies
+from robotid.robot.geometry import body_boxes, geometry_half_spaces
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
+_FOLDS = 6  # of the cross-validation, prior_weight = "cv"
 _MOST_LOADS = 20  # largest number of fits until the joint load torque has converged
 _DAMPED = 3  # number of fits after which only half of each change is applied
 _SETTLED = 1e-3  # change of the torque, relative to it, at which the fits have converged
 
 
+@dataclass(frozen=True, eq=False)
+class Known:
+    """A robot and the prior of its parameters."""
+
+    model: RobotModel
+    mapping: BaseMapping  # standard to base parameters
+    pi: Array  # (p,), standard parameters of the URDF
+    spread: Array  # (p,), prior standard deviations
+    share: float  # share of the rows that count as independent [-]
+    sigma: Array  # (n,), noise level of each joint [N m or N]
+    held_out: tuple[Factors, ...] = ()  # segments for choosing the weight and testing extents
+    repeated: float = 0.0  # share of errors of points of contact in the squared residual [-]
+
+    @property
+    def beta(self) -> Array:
+        """Base parameters of the URDF, shape (b,)."""
+        return self.mapping.to_base(self.pi)
+
+    @property
+    def covariance(self) -> Array:
+        """Prior covariance of the base parameters, shape (b, b)."""
+        KS = self.mapping.K * self.spread
+        return np.asarray(KS @ KS.T)
+
+    def standard(self, estimate: Estimate) -> Array:
+        """Standard parameters of an estimate, shape (p,)."""
+        return standard_of(estimate, self.mapping, self.pi, self.spread)[0]
+
+
+def make_estimator(
+    choice: EstimatorSettings, known: Known
+) -> estimators.BatchEstimator | estimators.RecursiveEstimator[Any]:
+    """Return the estimator that settings describe, for a robot and the prior of its parameters."""
+    share, sigma, beta = known.share, known.sigma, known.beta
+    match choice:
+        case settings.OLSSettings():
+            return estimators.OLS(independent_share=share)
+        case settings.WLSSettings():
+            return WLS(independent_share=share)
+        case settings.TLSSettings():
+            return estimators.TLS(choice.regressor_noise, independent_share=share)
+        case settings.ConsistentSettings():
+            return consistent_fit(choice, known)
+        case settings.RLSSettings():
+            # without forgetting the prior is not used: the result is that of batch least squares
+            std = np.sqrt(np.diag(known.covariance)) if choice.forgetting < 1 else None
+            return estimators.RLS(sigma, choice.forgetting, beta, std, share)
+        case settings.KalmanSettings():
+            gate = None if choice.gate is False else float(choice.gate)
+            return estimators.Kalman(sigma, beta, known.covariance, choice.walk, gate, share)
+        case settings.PRXSettings():
+            return estimators.PRX(sigma, beta, rng=np.random.default_rng(0))
+        case settings.GradientSettings():
+            return estimators.NormalisedGradient(sigma, beta, rng=np.random.default_rng(0))
+    raise SettingsError(f"{choice!r} describes no estimator of rows; use EstimatorSettings(name)")
+
+
+def consistent_fit(choice: BoundedSettings, known: Known) -> Consistent:
+    """Return the physically consistent estimator, which can also project an estimate."""
+    bounds, stated, model = choice.bounds, choice.prior_weight, known.model
+    geometry = geometry_half_spaces(model, bounds.com_within)
+    extent = body_boxes(model) if bounds.extent == "box" else {}
+    bounds = replace(bounds, pinned=pinned_links(bounds, model))
+    fit = Consistent(
+        layout=model.layout,
+        K=known.mapping.K,
+        prior=known.pi,
+        prior_std=known.spread,
+        held=held_parameters(model),
+        prior_weight=1.0 if isinstance(stated, str) else stated,
+        independent_share=known.share,
+        constraints=make_constraints(bounds, geometry, extent),
+        wls_noise=known.sigma,
+    )
+    folds = gather(known.held_out, _FOLDS)
+    how = {"auto": "cv"}.get(stated, stated) if isinstance(stated, str) else ""
+    if how == "cv" and len(folds) < 2:
+        how = ""
+    if not extent and not how:
+        return fit
+    segments = Segments.of(fit, folds)
+    if extent and (beyond := contradicted_extents(fit, segments)):
+        fit = replace(fit, constraints=fit.constraints.without_extent(beyond))
+    if not how:
+        return fit
+    weight = choose_weight(fit, segments, how, known.repeated)
+    if fit.constraints.extent and weight.loss > AS_GOOD:
+        unbound = replace(fit, constraints=fit.constraints.without_extent(fit.constraints.extent))
+        if AS_GOOD * loss_of(unbound, segments, weight.weight) < weight.loss:
+            fit, weight = unbound, choose_weight(unbound, segments, how, known.repeated)
+    return replace(
+        fit, prior_weight=weight.weight, plausible_weight=weight.plausible, choice=weight
+    )
+
+
+def pinned_links(bounds: ConstraintSettings, model: RobotModel) -> tuple[str, ...]:
+    """Return the links that keep the URDF's values: those stated, and those of negligible mass."""
+    bounded = {*bounds.pinned, *bounds.mass, *bounds.com}
+    return (*bounds.pinned, *(x for x in negligible_bodies(model) if x not in bounded))
+
+
+def make_constraints(
+    bounds: ConstraintSettings,
+    geometry: Mapping[str, tuple[Array, Array]],
+    extent: Mapping[str, Array] = MappingProxyType({}),
+) -> Constraints:
+    """Return the constraints in the form that the estimator needs."""
+    A = np.vstack([np.eye(3), -np.eye(3)])
+    com, extents = dict(geometry), dict(extent)
+    for name, (low, high) in bounds.boxes.items():
+        com[name] = (A, np.concatenate([high, np.negative(low)]))
+        if name in extents:  # a stated box enlarges the box of the geometry
+            lower, upper = extents[name]
+            extents[name] = np.array([np.minimum(lower, low), np.maximum(upper, high)])
+    return Constraints(bounds.masses, bounds.total, com, tuple(bounds.pinned), extents)
+
+
 def rough_choice(choice: EstimatorSettings) -> EstimatorSettings:
     """Return faster settings of the estimator, for fits whose residual only is used."""
-    if not isinstance(choice, BoundedSettings):
+    if not isinstance(choice, BoundedSettings) or not isinstance(choice.prior_weight, str):
         return choice
-    weight = 1.0 if isinstance(choice.prior_weight, str) else choice.prior_weight
-    return replace(choice, prior_weight=weight)
+    return replace(choice, prior_weight=1.0)
 
 
 def fit_recordings(recordings: Recordings, choice: EstimatorSettings) -> Fit:
@@ -84,7 +213,7 @@ def solve_recordings(
         estimate, in_cone, weighing = _run(choice, ground)
     except RankDeficientError as error:
         raise ground.determination.refusal(error) from error
-    standard, _ = standard_of(estimate, recordings.mapping, ground.before.pi, ground.before.spread)
+    standard = ground.before.standard(estimate)
     if recordings.model.layout.remembering:  # predictions use the load of the written parameters
         recordings = recordings.with_model(recordings.model.with_reference(standard))
     return Solved(choice, ground, recordings, estimate, in_cone, weighing, standard)
@@ -111,11 +240,11 @@ class Solved:
     @cached_property
     def solution(self) -> Solution:
         """The parameters with the recordings on which drive terms are tested."""
-        own = self.recordings
-        fitted, validation = evaluate_logs(own.fitted, own.validation, {}, None, plan=own.plan)
+        logs = self.recordings
+        fitted, validation = evaluate_logs(logs.fitted, logs.validation, {}, None, plan=logs.plan)
         return Solution(
-            model=own.model,
-            mapping=own.mapping,
+            model=logs.model,
+            mapping=logs.mapping,
             prior_std=self.prior_std,
             standard=self.standard,
             fitted=fitted,
@@ -124,22 +253,24 @@ class Solved:
 
     def with_errors(self) -> Fit:
         """Return the fit: the parameters with their standard errors and predictions."""
-        ground, recordings = self.ground, self.recordings
-        model, mapping, before = recordings.model, recordings.mapping, ground.before
+        ground, logs, before = self.ground, self.recordings, self.ground.before
+        mapping, K = logs.mapping, logs.mapping.K
         estimate, wls, errors = self._measured()
         _, covariance = standard_of(estimate, mapping, before.pi, before.spread)
-        base_variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)
-        wls_standard = mapping.to_standard(wls.theta, before.pi, before.spread)
-        driven = urdf_with_drives(model, mapping, ground.factors, before.sigma, before.spread)
+        driven = urdf_with_drives(logs.model, mapping, ground.factors, before.sigma, before.spread)
         fitted, validation = evaluate_logs(
-            recordings.fitted, recordings.validation,
-            {"estimate": self.standard, "wls": wls_standard},
-            before.pi, driven, plan=recordings.plan,
+            logs.fitted, logs.validation,
+            {"estimate": self.standard, "wls": before.standard(wls)},
+            before.pi, driven, plan=logs.plan,
         )  # fmt: skip
-        is_base = estimate.names == mapping.base_names
-        base_error = estimate.std_error if is_base else np.sqrt(np.maximum(base_variance, 0.0))
-        found = Fit(
-            model=model,
+        base_error = estimate.std_error
+        if estimate.names != mapping.base_names:
+            variance = np.einsum("bi,ij,bj->b", K, covariance, K)
+            base_error = np.sqrt(np.maximum(variance, 0.0))
+        sums = self._sums()
+        _, unit = np.unique([log.unit for log in logs.fitted], return_inverse=True)
+        fit = Fit(
+            model=logs.model,
             mapping=mapping,
             estimator=self.choice,
             estimate=estimate,
@@ -157,62 +288,58 @@ class Solved:
             factors=ground.factors,
             determination=ground.determination,
             regressor_noise=ground.noise,
+            sums=sums,
+            runs=() if sums is None else runs_of(logs.model, mapping, self.standard, sums, unit),
+            left_out=self._left_out(fitted),
         )
-        found = self._with_runs(found)
-        found = replace(found, left_out=self._left_out(fitted))
-        hidden = (mapping.K[:, ~found.at_bound] == 0).all(axis=1)  # sums of terms at bounds only
-        return replace(found, base_error=np.where(hidden, np.inf, base_error))
+        is_hidden = (K[:, ~fit.at_bound] == 0).all(axis=1)  # sums of terms at bounds only
+        return replace(fit, base_error=np.where(is_hidden, np.inf, base_error))
 
     def _left_out(self, fitted: Sequence[Evaluation]) -> dict[str, Metrics]:
         """Return the metrics of each log by a fit to the others, with the same prior weight."""
-        ground, own, mapping = self.ground, self.recordings, self.recordings.mapping
-        if own.validation or len(ground.logs) < FEWEST_LEFT_OUT:
+        ground, model, before = self.ground, self.recordings.model, self.ground.before
+        if self.recordings.validation or len(ground.logs) < FEWEST_LEFT_OUT:
             return {}
-        before, estimator = ground.before, make_estimator(self.choice, ground.before)
-        if estimator.reads != "factors":
+        estimator = self.in_cone or make_estimator(self.choice, before)
+        if estimator.reads != "factors" or isinstance(self.choice, RecursiveSettings):
             return {}
-        fit_to = estimator if self.in_cone is None else self.in_cone
 
         def fit(factors: Factors) -> tuple[Array, Array]:
-            standard, _ = standard_of(fit_to.fit(factors), mapping, before.pi, before.spread)
             sigma, spread = before.sigma, before.spread
-            return standard, urdf_with_drives(own.model, mapping, factors, sigma, spread)
+            driven = urdf_with_drives(model, before.mapping, factors, sigma, spread)
+            return before.standard(estimator.fit(factors)), driven
 
-        return left_out_metrics(own.model, ground.logs, fitted, fit)
+        return left_out_metrics(model, ground.logs, fitted, fit)
 
-    def _with_runs(self, fit: Fit) -> Fit:
-        """Return the fit with the information of each log on parameters that may vary."""
-        logs, own, mapping = self.ground.logs, self.recordings, self.recordings.mapping
-        if len(logs) < FEWEST_RUNS:
-            return fit
-        sums = sums_of(own.model, mapping, logs, self.standard, self.ground.rough.sigma)
-        noise, none = self.ground.noise, np.zeros(len(mapping.base_names))
-        shift = noise.shift if noise is not None and noise.is_corrected else none
-        sums = sums_with_zeros(sums, own, self.standard, shift)
-        _, unit = np.unique([log.unit for log in own.fitted], return_inverse=True)
-        runs = runs_of(own.model, mapping, self.standard, sums, unit)
-        return replace(fit, sums=sums, runs=runs)
+    def _sums(self) -> RunSums | None:
+        """Return the information of each log on parameters that may vary; None for few logs."""
+        ground, logs = self.ground, self.recordings
+        if len(ground.logs) < FEWEST_RUNS:
+            return None
+        sums = sums_of(logs.model, logs.mapping, ground.logs, self.standard, ground.rough.sigma)
+        noise, shift = ground.noise, np.zeros(len(logs.mapping.base_names))
+        if noise is not None and noise.is_corrected:
+            shift = noise.shift
+        return sums_with_zeros(sums, logs, self.standard, shift)
 
     def _measured(self) -> tuple[Estimate, Estimate, StandardErrors]:
         """Return the estimate and that of WLS with standard errors, and how these were found."""
         ground, fit, estimate = self.ground, self.in_cone, self.estimate
-        factors, rough, mapping = ground.factors, ground.rough, ground.recordings.mapping
-        segments, share, K = ground.segments, ground.before.share, mapping.K
-        more = ground.more(rough.sigma)
-        of_wls = None if ground.noise and self.weighing == "alike" else more  # of other weights
-        wls, errors = measured_errors(rough, segments, factors, share, K, rough.sigma, more=of_wls)
+        rough, mapping = ground.rough, ground.recordings.mapping
+        rows = ground.segments, ground.factors, ground.before.share, mapping.K
+        are_alike = self.weighing == "alike"
+        of_wls = None if ground.noise and are_alike else ground.more(rough.sigma)  # other weights
+        wls, errors = measured_errors(rough, *rows, rough.sigma, more=of_wls)
         if self.weighing == "by step" and fit is None:
             estimate = with_wls_errors(estimate, wls)
         else:
-            sigma = np.ones_like(rough.sigma) if self.weighing == "alike" else rough.sigma
+            sigma = np.ones_like(rough.sigma) if are_alike else rough.sigma
             if estimate.names == mapping.names:
                 sigma = estimate.sigma
-            more = ground.more(sigma)
-            ratio = 1.0 if fit is None else fit.weight_ratio
-            is_filter = self.weighing == "by age"
             estimate, errors = measured_errors(
-                estimate, segments, factors, share, K, sigma,
-                is_filter=is_filter, weight_ratio=ratio, bounded=fit, more=more,
+                estimate, *rows, sigma, is_filter=self.weighing == "by age",
+                weight_ratio=1.0 if fit is None else fit.weight_ratio, bounded=fit,
+                more=ground.more(sigma),
             )  # fmt: skip
         if (repeated := ground.recordings.repeated) is not None:
             errors = replace(errors, method=f"{errors.method}; {repeated.described}")
@@ -222,53 +349,32 @@ class Solved:
         return estimate, wls, errors
 
 
-def sums_of_logs(
-    recordings: Recordings, choice: EstimatorSettings, standard: Array, sigma: Array, shift: Array
-) -> RunSums:
-    """Return the sums of logs that are not fitted, about the parameters of a fit to others.
-
-    standard (p,), sigma (n,) [N m or N], shift (b,).
-    """
-    model, mapping = recordings.model, recordings.mapping
-    if choice.is_robust:
-        recordings, _ = reweigh(recordings, choice.loss, model.standard_parameters())
-    logs = [
-        [part.factors.without(shift) for part in parts if part.factors.rows.any()]
-        for parts in recordings.reduce_logs()
-    ]
-    sums = sums_of(model, mapping, logs, standard, sigma)
-    return sums_with_zeros(sums, recordings, standard, shift)
-
-
 def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Recordings:
     """Return recordings with the joint load torque of the bodies fitted to them.
 
     Least squares fits are iterated until the load torque has converged; the last step uses the
     estimator itself.
     """
-    model, mapping = recordings.model, recordings.mapping
-    if not is_loaded(model):
+    if not is_loaded(recordings.model):
         return recordings
     choice = rough_choice(choice)
-    own = replace(recordings, validation=())  # no predictions are needed here
-    spread = None
+    trial, spread = replace(recordings, validation=()), None  # no predictions are needed here
     for step in range(_MOST_LOADS):
-        ground = _ground(own, choice, is_last=False, spread=spread)
-        before = ground.before
+        ground = _ground(trial, choice, is_last=False, spread=spread)
+        before, levels = ground.before, ground.rough.sigma
         spread = before.spread  # the same for any load
-        standard, _ = standard_of(ground.rough, mapping, before.pi, before.spread)
-        moved = standard - own.model.carried_by
+        standard = before.standard(ground.rough)
+        moved = standard - trial.model.carried_by
         if step >= _DAMPED:  # friction that depends strongly on the load may overshoot
             standard = standard - 0.5 * moved
-        loads = [_size_of(ground, x) for x in (moved, standard)]
-        if (loads[0] <= _SETTLED * loads[1]).all():
+        changes, torques = (_torque_norms(ground, x) for x in (moved, standard))
+        if (changes <= _SETTLED * torques).all():
             estimator = make_estimator(choice, before)
             if estimator.reads == "factors":
-                estimate = estimator.fit(ground.factors)
-                standard, _ = standard_of(estimate, mapping, before.pi, before.spread)
-            recordings = replace(recordings, levels=ground.rough.sigma)
-            return recordings.with_model(model.with_reference(standard))
-        own = replace(own, levels=ground.rough.sigma).with_model(model.with_reference(standard))
+                standard = before.standard(estimator.fit(ground.factors))
+            recordings = replace(recordings, levels=levels)
+            return recordings.with_model(recordings.model.with_reference(standard))
+        trial = replace(trial, levels=levels).with_model(trial.model.with_reference(standard))
     raise NotConvergedError(
         f"the joint load torque has not converged after {_MOST_LOADS} fits; set friction = "
         "'viscous+coulomb', or record a motion that excites more parameters",
@@ -276,12 +382,11 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
     )
 
 
-def _size_of(ground: "_Ground", pi: Array) -> Array:
+def _torque_norms(ground: "_Ground", pi: Array) -> Array:
     """Return the norm of the torque of parameters over all rows of each joint, shape (n_rows,)."""
-    factors, mapping = ground.factors, ground.recordings.mapping
-    beta = mapping.to_base(pi)
-    rows = zip(factors.triangles, factors.columns, strict=True)
-    return np.array([float(np.linalg.norm(R[:, :-1] @ beta[own])) for R, own in rows])
+    beta = ground.before.mapping.to_base(pi)
+    rows = zip(ground.factors.triangles, ground.factors.columns, strict=True)
+    return np.array([float(np.linalg.norm(R[:, :-1] @ beta[columns])) for R, columns in rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,7 +394,7 @@ class _Ground:
     """The input of every estimator."""
 
     recordings: Recordings  # rows weighted if the loss is robust
-    whole: Reduction  # reduction of all fitted rows, base parameters
+    reduction: Reduction  # of all fitted rows, base parameters
     before: Known  # the prior
     logs: tuple[tuple[Factors, ...], ...]  # segments of each log; none in intermediate fits
     rough: Estimate  # weighted least squares
@@ -300,7 +405,7 @@ class _Ground:
     @property
     def factors(self) -> Factors:
         """The factors of all fitted rows."""
-        return self.whole.factors
+        return self.reduction.factors
 
     @property
     def segments(self) -> tuple[Factors, ...]:
@@ -316,9 +421,10 @@ class _Ground:
     @cached_property
     def determination(self) -> Determination:
         """Which base parameters the rows determine."""
-        before, factors, K = self.before, self.factors, self.recordings.mapping.K
+        before, factors = self.before, self.factors
         rows = factors.weighted(before.sigma / np.sqrt(before.share))[:, :-1]
-        return determine(factors.names, rows, base_spread(K, before.spread, self.pinned))
+        spread = base_spread(before.mapping.K, before.spread, self.pinned)
+        return determine(factors.names, rows, spread)
 
 
 def _ground(
@@ -326,12 +432,9 @@ def _ground(
     choice: EstimatorSettings,
     *,
     is_last: bool,
-    spread: Array | None = None,
+    spread: Array | None = None,  # (p,), prior standard deviations if they are known
 ) -> _Ground:
-    """Reduce the rows, reweighted if the loss is robust, to the input of every estimator.
-
-    The prior standard deviations, shape (p,), are computed if they are None.
-    """
+    """Reduce the rows, reweighted if the loss is robust, to the input of every estimator."""
     model, mapping = recordings.model, recordings.mapping
     prior, understated = model.standard_parameters(), 1.0
     if choice.is_robust:
@@ -365,7 +468,7 @@ def _without_regressor_noise(ground: _Ground, choice: EstimatorSettings) -> _Gro
         return ground
     level, theta = ground.rough.sigma, ground.rough.theta
     sigma = np.ones_like(level) if choice.has_equal_weights else level
-    noise = find_regressor_noise(ground.recordings, ground.whole, theta, sigma, level)
+    noise = find_regressor_noise(ground.recordings, ground.reduction, theta, sigma, level)
     if noise is None:
         return ground
     if isinstance(choice, RecursiveSettings):
@@ -374,7 +477,7 @@ def _without_regressor_noise(ground: _Ground, choice: EstimatorSettings) -> _Gro
     logs = tuple(tuple(part.without(noise.shift) for part in log) for log in ground.logs)
     return replace(
         ground,
-        whole=replace(ground.whole, factors=ground.factors.without(noise.shift)),
+        reduction=replace(ground.reduction, factors=ground.factors.without(noise.shift)),
         before=replace(ground.before, held_out=tuple(chain.from_iterable(logs))),
         logs=logs,
         rough=replace(ground.rough, theta=theta - noise.shift),
@@ -386,23 +489,36 @@ def _run(
     choice: EstimatorSettings, ground: _Ground
 ) -> tuple[Estimate, Consistent | None, Weighing]:
     """Return the estimate, the estimator that made it consistent, if any, and the weighting."""
-    recordings, before = ground.recordings, ground.before
+    before = ground.before
     estimator = make_estimator(choice, before)
-    if recordings.model.is_static and estimator.needs_mass:
-        raise SettingsError(
-            f"the estimator {choice.name!r} needs the mass matrix, which dynamics = 'static' does "
-            "not identify; use another estimator, or set dynamics = 'full'"
-        )
     if estimator.reads == "factors":
         in_cone = estimator if isinstance(estimator, Consistent) else None
         return estimator.fit(ground.factors), in_cone, estimator.weighing
-    estimate = estimator.fit(recordings.problem(with_mass=estimator.needs_mass))
+    estimate = estimator.fit(ground.recordings.problem())
     if not (isinstance(choice, RecursiveSettings) and choice.physical):
         return estimate, None, estimator.weighing
     if estimator.weighing == "by step":
         estimate = with_wls_errors(estimate, ground.rough)
     fit = consistent_fit(choice, before)
     return fit.project(estimate), fit, estimator.weighing
+
+
+def sums_of_logs(
+    recordings: Recordings, choice: EstimatorSettings, standard: Array, sigma: Array, shift: Array
+) -> RunSums:
+    """Return the sums of logs that are not fitted, about the parameters of a fit to others.
+
+    standard (p,), sigma (n,) [N m or N], shift (b,).
+    """
+    model, mapping = recordings.model, recordings.mapping
+    if choice.is_robust:
+        recordings, _ = reweigh(recordings, choice.loss, model.standard_parameters())
+    logs = [
+        [part.factors.without(shift) for part in parts if part.factors.rows.any()]
+        for parts in recordings.reduce_logs()
+    ]
+    sums = sums_of(model, mapping, logs, standard, sigma)
+    return sums_with_zeros(sums, recordings, standard, shift)
 
 
 def sums_with_zeros(
@@ -416,8 +532,7 @@ def sums_with_zeros(
     standard (p,), shift (b,).
     """
     model, mapping = recordings.model, recordings.mapping
-    groups = [group for group, _ in groups_at(model, mapping, standard)]
-    z = sum(group.kind == "zero" for group in groups)
+    z = sum(group.kind == "zero" for group, _ in groups_at(model, mapping, standard))
     if not (z and recordings.is_in_memory):
         return sums
     theta, parts = mapping.to_base(standard) + shift, []
@@ -443,8 +558,6 @@ def urdf_with_drives(
 
     Weighted least squares of the drive terms d >= 0 (offsets of either sign) with the bodies' pi_I
     as in the URDF: min sum_j |R_j K_I pi_I + R_j K_D d - tau_j|^2 / sigma_j^2.
-
-    sigma (n,) [N m or N], spread (p,).
     """
     from scipy.optimize import lsq_linear
 
@@ -458,6 +571,6 @@ def urdf_with_drives(
     scale = spread[size:]
     lowest = np.where(model.layout.is_nonnegative()[size:], 0.0, -np.inf)
     X = R @ mapping.K[:, size:] * scale
-    found = lsq_linear(X, tau - R @ mapping.to_base(pi), bounds=(lowest, np.inf), method="bvls")
-    pi[size:] = scale * found.x
+    solution = lsq_linear(X, tau - R @ mapping.to_base(pi), bounds=(lowest, np.inf), method="bvls")
+    pi[size:] = scale * solution.x
     return pi

@@ -47,21 +47,16 @@ from robotid.robot.parameters import pseudo_inertia
 
 #: The possible sources of the value of a standard parameter.
 SOURCES = ("data", "mixed", "prior", "bound")
-FROM_DATA = 0.3  # standard error over prior standard deviation below which the source is the data
-FROM_PRIOR = 0.9  # ... and above which it is the prior
-_KNOWN = 1e-300  # smallest prior standard deviation, of fixed parameters
-_STAYED = 0.3  # change in prior standard deviations up to which the source may be the prior
+#: Standard error over prior standard deviation below which the source is the data (a change above
+#: it does not come from the prior alone), and above which it is the prior.
+FROM_DATA, FROM_PRIOR = 0.3, 0.9
 _WORSE = 1.2  # error of WLS over that of the estimate above which it is clearly worse
 _AT_BOUND = 1e-6  # size of a drive term at its bound of 0, in prior standard deviations
-_COVERAGE = 0.95
 _SPEEDS = 20  # points of a friction curve in each direction
 
 
 def sources_of(share: Array, is_prior: Array, is_bound: Array) -> tuple[str, ...]:
-    """Return the source of the value of each parameter, of ``SOURCES``.
-
-    share (p,) [-], is_prior (p,), is_bound (p,).
-    """
+    """Return the source of the value of each parameter, of ``SOURCES``; arguments (p,)."""
     names = np.select([is_prior, is_bound, share < FROM_DATA], ["prior", "bound", "data"], "mixed")
     return tuple(names.tolist())
 
@@ -80,13 +75,11 @@ class Identified(ABC):
 
     @property
     @abstractmethod
-    def standard_error(self) -> Array:
-        """Standard errors of the standard parameters, shape (p,); inf if there is none."""
+    def standard_error(self) -> Array: ...  # (p,), of the standard parameters; inf if there is none
 
     @property
     @abstractmethod
-    def standard_quantile(self) -> Array:
-        """Half-width of each standard parameter's 95 % interval in standard errors, shape (p,)."""
+    def standard_quantile(self) -> Array: ...  # (p,), half-width of 95 % intervals [std errors]
 
     @property
     @abstractmethod
@@ -100,39 +93,29 @@ class Identified(ABC):
 
     @property
     @abstractmethod
-    def sources(self) -> tuple[str, ...]:
-        """The source of the value of each standard parameter, of ``SOURCES``."""
+    def sources(self) -> tuple[str, ...]: ...  # of the value of each standard parameter
 
     @property
     @abstractmethod
-    def undetermined(self) -> tuple[str, ...]:
-        """Names of the base parameters that are not identifiable."""
+    def undetermined(self) -> tuple[str, ...]: ...  # names of parameters that are not identifiable
 
     @property
     @abstractmethod
-    def moments(self) -> Mapping[str, DriveMoments]:
-        """Moments that project the friction of each drive on simpler terms, by drive."""
+    def moments(self) -> Mapping[str, DriveMoments]: ...  # that project each drive's friction
 
     @property
     @abstractmethod
-    def is_consistent(self) -> bool:
-        """Whether the parameters are physically consistent."""
+    def is_consistent(self) -> bool: ...  # physically
 
     @property
     def standard_interval(self) -> Array:
-        """95 % interval of each standard parameter, shape (p, 2); infinite if there is none.
-
-        Its half-width is ``standard_quantile`` standard errors.
-        """
+        """95 % interval of each standard parameter, shape (p, 2); infinite if there is none."""
         half = self.standard_quantile * self.standard_error
         return np.column_stack([self.standard - half, self.standard + half])
 
     @property
     def base_interval(self) -> Array:
-        """95 % interval of each base parameter, shape (b, 2).
-
-        It is infinite if the parameter is not identifiable or is at its bound.
-        """
+        """95 % interval of each base parameter, shape (b, 2); infinite if there is none."""
         half = self.base_quantile * self.base_error
         return np.column_stack([self.base - half, self.base + half])
 
@@ -249,14 +232,13 @@ class Fit(Identified, Solution):
     def is_consistent(self) -> bool:
         """Whether every body, every drive and the mass matrix are physically consistent.
 
-        A body is checked without its links on locked joints, which keep their own inertials. The
-        mass matrix must be positive definite at random poses.
+        A body is checked without its links on locked joints, which keep their own inertials.
         """
-        size = self.model.layout.n_inertial
-        J = pseudo_inertia(self.standard[:size] - held_parameters(self.model))
-        signs = self.standard[self.model.layout.is_nonnegative()]
-        is_possible = bool((np.linalg.eigvalsh(J) > 0).all() and (signs >= 0).all())
-        return is_possible and self.mass_matrix.is_positive
+        layout = self.model.layout
+        J = pseudo_inertia(self.standard[: layout.n_inertial] - held_parameters(self.model))
+        are_bodies = bool((np.linalg.eigvalsh(J) > 0).all())
+        are_drives = bool((self.standard[layout.is_nonnegative()] >= 0).all())
+        return are_bodies and are_drives and self.mass_matrix.is_positive
 
     @property
     def mass_matrix(self) -> MassMatrixCheck:
@@ -267,10 +249,7 @@ class Fit(Identified, Solution):
 
     @cached_property
     def at_bound(self) -> Array:
-        """Which drive terms are at their bound of 0, shape (p,), bool.
-
-        Their value without the bound is not known, so they have no standard error.
-        """
+        """Which drive terms are at their bound of 0 and have no standard error, shape (p,)."""
         is_bounded = bool(self.estimate.details.get("constraints"))
         is_zero = self.standard <= _AT_BOUND * self.prior_std
         return np.asarray(self.model.layout.is_nonnegative() & is_zero & is_bounded)
@@ -293,28 +272,27 @@ class Fit(Identified, Solution):
         * "mixed": data and URDF together, in sums with other parameters, or a setting of the user.
         """
         layout, unbounded = self.model.layout, self.errors.unbounded
-        after = self.standard_error if unbounded is None else unbounded  # without bounds
-        share = after / np.maximum(self.prior_std, _KNOWN)
-        moved = np.abs(self.standard - self.prior) > _STAYED * self.prior_std
-        active = self.estimate.details.get("active", ())
-        is_bound = layout.owned_by([label.split(" ", 1)[1] for label in active if " " in label])
-        masses = self.estimator.bounds.masses.items()
+        error = self.standard_error if unbounded is None else unbounded
+        is_free = self.prior_std > 0.0
+        of_fixed = np.where(error > 0.0, np.inf, 0.0)
+        share = np.divide(error, self.prior_std, out=of_fixed, where=is_free)
+        is_moved = np.abs(self.standard - self.prior) > FROM_DATA * self.prior_std
+        details, masses = self.estimate.details, self.estimator.bounds.masses.items()
         fixed = [f"{link}.m" for link, mass in masses if np.ptp(mass) == 0]
-        is_prior = layout.owned_by(self.estimate.details.get("pinned", ()))
-        is_prior = is_prior | np.isin(layout.names, fixed) | ((share > FROM_PRIOR) & ~moved)
-        is_bound = self.at_bound | (is_bound & moved & (share >= FROM_DATA))
-        return sources_of(share, is_prior, is_bound)
+        is_prior = layout.owned_by(details.get("pinned", ())) | np.isin(layout.names, fixed)
+        is_prior |= (share > FROM_PRIOR) & ~is_moved
+        bounded = [x.split(" ", 1)[1] for x in details.get("active", ()) if " " in x]
+        is_bound = layout.owned_by(bounded) & is_moved & (share >= FROM_DATA)
+        return sources_of(share, is_prior, self.at_bound | is_bound)
 
     @property
     def standard_quantile(self) -> Array:
         """Half-width of each standard parameter's 95 % interval in standard errors, shape (p,).
 
-        The quantile is that of the base parameter with the fewest degrees of freedom, among those
-        that contain the parameter.
+        The quantile is the largest of the base parameters that contain the parameter.
         """
-        own = np.where(self.mapping.K != 0.0, self.errors.quantile[:, None], QUANTILE)  # (b, p)
-        quantile: Array = own.max(axis=0)
-        return quantile
+        quantile = np.where(self.mapping.K != 0.0, self.errors.quantile[:, None], QUANTILE)
+        return np.asarray(quantile.max(axis=0))
 
     @property
     def base_quantile(self) -> Array:
@@ -328,7 +306,8 @@ class Fit(Identified, Solution):
     @cached_property
     def moments(self) -> dict[str, DriveMoments]:
         """Moments that project drive friction on simpler terms, from the fitted rows, by drive."""
-        return fitted_moments(self)
+        rows = ((e.recording.trajectory, e.recording.mask) for e in self.fitted)
+        return drive_moments(self.model, rows)
 
     def band(self, evaluation: Evaluation) -> TorqueBand:
         """Return the uncertainty band of the torques predicted for a recording.
@@ -338,16 +317,14 @@ class Fit(Identified, Solution):
                 and the spread of the drives between three or more fitted logs.
         """
         require_kind(evaluation, Evaluation, "evaluation", "an evaluation of recordings")
-        every = zip((*self.fitted, *self.validation), self._bands, strict=True)
-        own = next((band for e, band in every if e is evaluation), None)
-        return expected_band(self, evaluation, self.between) if own is None else own
+        for known, band in zip((*self.fitted, *self.validation), self._bands, strict=True):
+            if known is evaluation:
+                return band
+        return expected_band(self, evaluation, self.between)
 
     @cached_property
     def between(self) -> Array | None:
-        """Covariance of the standard parameters in another log, in addition to that of the fit.
-
-        Shape (p, p); None for fewer than three fitted logs.
-        """
+        """What another log adds to the parameters' covariance, (p, p); None for under 3 logs."""
         if self.variation is None:
             return None
         return between_covariance(self.variation.to_dict(), self.model.layout.names)
@@ -380,6 +357,11 @@ class Fit(Identified, Solution):
         return tuple(e for e in self.validation if e.is_refitted)
 
     @property
+    def _unseen(self) -> tuple[Evaluation, ...]:
+        """Validation recordings without fitted rows."""
+        return tuple(e for e in self.validation if not e.is_refitted)
+
+    @property
     def is_poorly_excited(self) -> bool:
         """Whether parameters are not identifiable because of too little excitation, not noise."""
         return is_poorly_excited(self.wls, len(self.base))
@@ -392,8 +374,7 @@ class Fit(Identified, Solution):
         """
         if not self.validation:
             return dict(self.left_out)
-        new = (e for e in self.validation if not e.is_refitted)
-        return {e.name: e.metrics["estimate"] for e in new}
+        return {e.name: e.metrics["estimate"] for e in self._unseen}
 
     @cached_property
     def overfitted(self) -> frozenset[str]:
@@ -401,46 +382,36 @@ class Fit(Identified, Solution):
 
         A smaller residual of WLS on the fitted recordings then is no evidence against the estimate.
         """
-        new = [e.metrics for e in self.validation if not e.is_refitted]
-        pairs = [(x["estimate"].per_joint, x["wls"].per_joint) for x in new]
+        pairs = [[e.metrics[x].per_joint for x in ("estimate", "wls")] for e in self._unseen]
         return frozenset(
             joint
             for joint in (pairs[0][0] if pairs else ())
-            if all(wls[joint].rmse > _WORSE * own[joint].rmse for own, wls in pairs)
+            if all(wls[joint].rmse > _WORSE * estimate[joint].rmse for estimate, wls in pairs)
         )
 
 
-def expected_band(found: Fit, evaluation: Evaluation, between: Array | None = None) -> TorqueBand:
-    """Return the torque band of a recording by the fit's noise level, not by its own residual.
-
-    between (p, p).
-    """
-    K, motion = found.mapping.K, evaluation.recording.trajectory
-    moves = np.array([term.moves for term in found.open_terms]).reshape(-1, K.shape[1])
-    C = found.standard_covariance - moves.T @ moves
+def expected_band(fit: Fit, evaluation: Evaluation, between: Array | None = None) -> TorqueBand:
+    """Return the torque band of a recording by the noise level of the fit; between (p, p)."""
+    K, recording = fit.mapping.K, evaluation.recording
+    moves = np.array([term.moves for term in fit.open_terms]).reshape(-1, K.shape[1])
+    C = fit.standard_covariance - moves.T @ moves
     covariance = K @ (C if between is None else C + between) @ K.T
 
-    def torques(rows: Array) -> list[Array]:
-        model = found.model.with_reference(found.standard)
-        return open_torques(model, found.open_terms, evaluation.recording, rows)
-
     def errors(rows: Array) -> list[tuple[Array, Array]]:
-        return list(zip(moves @ K.T, torques(rows), strict=True))
+        model = fit.model.with_reference(fit.standard)
+        torques = open_torques(model, fit.open_terms, recording, rows)
+        return list(zip(moves @ K.T, torques, strict=True))
 
-    sigma = found.estimate.sigma
-    return torque_band(found.model, found.mapping, motion, covariance, sigma, errors)
-
-
-def next_errors(found: Fit) -> Array:
-    """Return the expected RMS torque error of the next log, shape (n_rows,) [N m, N].
-
-    Its motion is like that of the fitted logs, and its drives vary like theirs.
-    """
-    bands = [expected_band(found, evaluation, found.between) for evaluation in found.fitted]
-    return rms_error(bands)
+    sigma = fit.estimate.sigma
+    return torque_band(fit.model, fit.mapping, recording.trajectory, covariance, sigma, errors)
 
 
-def recording_bands(found: Fit) -> tuple[TorqueBand, ...]:
+def next_errors(fit: Fit) -> Array:
+    """Return the expected RMS torque error of a log like the fitted ones, (n_rows,) [N m, N]."""
+    return rms_error([expected_band(fit, evaluation, fit.between) for evaluation in fit.fitted])
+
+
+def recording_bands(fit: Fit) -> tuple[TorqueBand, ...]:
     """Return the torque band of each recording from its residuals, fitted recordings first.
 
     The noise part is chosen so that the bands contain 95 % of the torques of all recordings of the
@@ -448,59 +419,51 @@ def recording_bands(found: Fit) -> tuple[TorqueBand, ...]:
     motion, and the band covers further motions as it covers these (split conformal prediction, Lei
     et al. 2018, doi:10.1080/01621459.2017.1307116, with the parameters' part as the lower bound).
     """
-    evaluations = (*found.fitted, *found.validation)
-    is_fitted = [k < len(found.fitted) or e.is_refitted for k, e in enumerate(evaluations)]
+    evaluations = (*fit.fitted, *fit.validation)
+    is_fitted = [k < len(fit.fitted) or e.is_refitted for k, e in enumerate(evaluations)]
     bands = [
-        expected_band(found, evaluation, None if is_own else found.between)
-        for evaluation, is_own in zip(evaluations, is_fitted, strict=True)
+        expected_band(fit, e, None if is_own else fit.between)
+        for e, is_own in zip(evaluations, is_fitted, strict=True)
     ]
-    own: dict[bool, list[tuple[TorqueBand, Evaluation]]] = {True: [], False: []}
-    for kind, band, evaluation in zip(is_fitted, bands, evaluations, strict=True):
-        own[kind].append((band, evaluation))
-    noise = {kind: _residual_noise(pairs) for kind, pairs in own.items() if pairs}
+    noise = {}
+    for kind in set(is_fitted):
+        alike = [k for k, is_own in enumerate(is_fitted) if is_own == kind]
+        noise[kind] = _residual_noise([bands[k] for k in alike], [evaluations[k] for k in alike])
     pairs = zip(bands, is_fitted, strict=True)
     return tuple(replace(band, noise=noise[kind]) for band, kind in pairs)
 
 
-def _residual_noise(own: Sequence[tuple[TorqueBand, Evaluation]]) -> Array:
+def _residual_noise(bands: Sequence[TorqueBand], evaluations: Sequence[Evaluation]) -> Array:
     """Return the noise with which bands contain 95 % of the torques, shape (n_rows,) [N m, N]."""
-    noise = own[0][0].noise.copy()
-    rows = []
-    for band, e in own:
-        residual = e.recording.trajectory.tau - e.torques["estimate"]
-        rows.append((band.parameters, residual[band.samples], e.recording.mask[band.samples]))
-    std, residual, mask = (np.concatenate(part) for part in zip(*rows, strict=True))
-    needed = (residual / QUANTILE) ** 2 - std**2
-    for j, used in enumerate(mask.T.astype(bool)):
-        if used.any():
-            noise[j] = np.sqrt(max(np.quantile(needed[used, j], _COVERAGE), 0.0))
+    noise, parts = bands[0].noise.copy(), []
+    for band, e in zip(bands, evaluations, strict=True):
+        residual = (e.recording.trajectory.tau - e.torques["estimate"])[band.samples]
+        needed = (residual / QUANTILE) ** 2 - band.parameters**2
+        parts.append(np.where(e.recording.mask[band.samples], needed, np.nan))
+    variance = np.concatenate(parts)
+    for j in np.flatnonzero(np.isfinite(variance).any(axis=0)):
+        noise[j] = np.sqrt(max(np.nanquantile(variance[:, j], 0.95), 0.0))
     return noise
 
 
 def typical_friction(
-    found: Fit,
+    fit: Fit,
     joint: str,
     v: ArrayLike | None = None,
     *,
     q: float | None = None,
     load: float | None = None,
 ) -> FrictionCurve:
-    """Return friction and offset of a drive under the conditions of the fitted logs.
-
-    See ``friction_curve``.
-
-    v (k,) [rad/s or m/s].
-    """
-    layout, d = found.model.layout, _drive_number(found, joint)
-    ratios, first = layout.drive_ratios[d], found.model.n_rows - len(found.model.joints)
-    rows = [e.recording.mask[:, first:][:, ratios != 0.0].all(axis=1) for e in found.fitted]
-    motions = [e.recording.trajectory for e in found.fitted]
+    """Return friction and offset of a drive under the conditions of the fitted logs: v (k,)."""
+    layout, d = fit.model.layout, _drive_number(fit, joint)
+    ratios, n = layout.drive_ratios[d], len(fit.model.joints)
+    is_used = [e.recording.mask[:, -n:][:, ratios != 0.0].all(axis=1) for e in fit.fitted]
+    rows, motions = np.concatenate(is_used), [e.recording.trajectory for e in fit.fitted]
     for name, value in (("q", q), ("load", load)):
         if not (value is None or is_number(value)):
             raise DataError(f"{name} is {str(value)[:60]!r}, wanted a finite number or None")
     if v is None:
-        used = zip(motions, rows, strict=True)
-        speeds = np.concatenate([np.abs(m.v[is_used, first:] @ ratios) for m, is_used in used])
+        speeds = np.abs(np.concatenate([m.v[:, -n:] for m in motions])[rows] @ ratios)
         if not speeds.any():
             raise DataError(
                 f"{joint} was at rest in the fitted logs, so the range of speeds is not known; "
@@ -508,62 +471,50 @@ def typical_friction(
             )
         side = np.linspace(speeds.min(), speeds.max(), _SPEEDS)
         v = np.append(-side[::-1], side)
-    if q is None:
-        angles = [m.q[:, m.q.shape[1] - len(ratios) :] for m in motions]  # without the base's pose
-        positions = [x[is_used] @ ratios for x, is_used in zip(angles, rows, strict=True)]
-        q = float(np.median(np.concatenate(positions))) if np.any(np.concatenate(rows)) else 0.0
+    if q is None:  # without the pose of the base
+        positions = np.concatenate([m.q[:, -n:] for m in motions])[rows] @ ratios
+        q = float(np.median(positions)) if len(positions) else 0.0
     if load is None:
         load = 0.0
         if any(term.name == "load" for term in layout.own.get(joint, ())):
-            loads = [drive_motion_along(found.model, m).load[d] for m in motions]
-            load = float(np.sqrt(np.mean(np.concatenate(loads)[np.concatenate(rows)] ** 2)))
+            loads = [drive_motion_along(fit.model, m).load[d] for m in motions]
+            load = float(np.sqrt(np.mean(np.concatenate(loads)[rows] ** 2)))
     speeds = real_numbers(v, "v")
     if speeds.ndim != 1 or not np.isfinite(speeds).all():
         raise DataError(f"v has shape {speeds.shape}, wanted finite speeds, shape (k,)")
-    return friction_curve(found, joint, speeds, q=q, load=load)
-
-
-def fitted_moments(found: Fit) -> dict[str, DriveMoments]:
-    """Return the moments that project drive friction on simpler terms, from the fitted rows."""
-    rows = ((e.recording.trajectory, e.recording.mask) for e in found.fitted)
-    return drive_moments(found.model, rows)
+    return friction_curve(fit, joint, speeds, q=q, load=load)
 
 
 def friction_curve(
-    found: Fit, joint: str, v: Array, *, q: float = 0.0, load: float = 0.0
+    fit: Fit, joint: str, v: Array, *, q: float = 0.0, load: float = 0.0
 ) -> FrictionCurve:
-    """Return friction and offset of a drive against its speed, with the band of its parameters.
+    """Return friction and offset of a drive against its speed v (k,), with their band.
 
     Friction terms with an internal state have their value after long motion in one direction.
-
-    v (k,) [rad/s or m/s].
     """
-    layout, d = found.model.layout, _drive_number(found, joint)
+    layout, d = fit.model.layout, _drive_number(fit, joint)
     none = np.zeros_like(v)
     motion = DriveMotion(q + none, v, none, np.sign(v), load + none, none)
-    own = [
-        (k, term)
-        for k, (drive, term) in enumerate(layout.drive_parameters, start=layout.n_inertial)
-        if drive == d and not term.is_inertia
-    ]
-    X = np.column_stack([none, *(term.column(motion) for _, term in own)])[:, 1:]
-    k = [k for k, _ in own]
-    moves = np.array([term.moves[k] for term in found.open_terms]).reshape(-1, len(k))
-    C = found.standard_covariance[np.ix_(k, k)] - moves.T @ moves
+    drive_terms = enumerate(layout.drive_parameters, start=layout.n_inertial)
+    terms = {k: x for k, (drive, x) in drive_terms if drive == d and not x.is_inertia}
+    places = list(terms)
+    X = np.array([term.column(motion) for term in terms.values()]).reshape(len(terms), len(v)).T
+    moves = np.array([term.moves[places] for term in fit.open_terms]).reshape(-1, len(places))
+    C = fit.standard_covariance[np.ix_(places, places)] - moves.T @ moves
     variance = np.einsum("ij,jk,ik->i", X, C, X)
-    for term, moved in zip(found.open_terms, moves @ X.T, strict=True):
+    for term, moved in zip(fit.open_terms, moves @ X.T, strict=True):
         if term.joint == joint:  # the term's own torque adds to the change of the parameters
             moved = moved + term.torque(motion, JointMotion.steady(motion))
         variance += moved**2
-    return FrictionCurve(v, X @ found.standard[k], np.sqrt(np.maximum(variance, 0.0)), load)
+    return FrictionCurve(v, X @ fit.standard[places], np.sqrt(np.maximum(variance, 0.0)), load)
 
 
-def _drive_number(found: Fit, joint: str) -> int:
+def _drive_number(fit: Fit, joint: str) -> int:
     require_kind(joint, str, "joint", "the name of a joint or of a coupling")
-    names = [drive.name for drive in found.model.layout.drives]
+    names = [drive.name for drive in fit.model.layout.drives]
     if joint not in names:
         raise DataError(
-            f"{joint!r} is no drive of {found.model.name}; drives: {listed(names)}"
+            f"{joint!r} is no drive of {fit.model.name}; drives: {listed(names)}"
             f"{suggestion(joint, names)}"
         )
     return names.index(joint)

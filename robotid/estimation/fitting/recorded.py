@@ -1,27 +1,485 @@
-"""The logs of an identification: their triangular factors and their samples."""
+"""The logs of a fit, of any length: surveyed once, read in pieces, and reduced to factors.
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import chain, islice
+The survey of a file reads the time stamps of all rows and a few windows of all columns, and
+resolves automatic settings for the whole log. A piece is a fixed range of rows, read with some rows
+before and after it. A log in memory is one piece.
+"""
+
+from bisect import bisect_right
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from itertools import chain, islice, pairwise
+from pathlib import Path
 
 import numpy as np
 
+from robotid.base.exceptions import DataError
+from robotid.base.findings import listed
+from robotid.base.text import seconds
 from robotid.base.typing import Array
-from robotid.data.log import Trajectory
+from robotid.data.base_motion import bias_at_rest
+from robotid.data.files.read import LogLayout, open_table
+from robotid.data.files.table import Place, RowReader, Table
+from robotid.data.log import Log, Trajectory, blocks_of, map_stamps, median_step
+from robotid.data.signal_settings import SignalSettings
+from robotid.data.signals import (
+    SPLINE,
+    Segment,
+    decide,
+    filter_reach,
+    process_segments,
+    too_short,
+    unwrap,
+)
+from robotid.data.units import check_reach, check_units
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
+from robotid.dynamics.constraint_rows import constrained, logged_base
 from robotid.dynamics.factors import Factors, Reduction, compress_segments, join_segments
-from robotid.dynamics.prepared_logs import base_problem, independent_share
+from robotid.dynamics.prediction import is_loaded, remember
+from robotid.dynamics.prepared_logs import (
+    base_problem,
+    closed_log,
+    independent_share,
+    prefers_measured,
+    row_mask,
+    static_rows,
+    with_contacts,
+)
 from robotid.dynamics.problem import Block, Problem, concatenate
-from robotid.dynamics.rows import keep_inertial_rows
-from robotid.estimation.fitting.survey import ReducedPiece, SurveyedLog
+from robotid.dynamics.rows import COMPILED, choose_engine, friction_speeds, keep_inertial_rows
 from robotid.estimation.work_plan import WorkPlan
 from robotid.robot.model import RobotModel
 
+#: Default number of rows of a piece.
+PIECE = 16384
+#: Rows of each window that is checked.
+WINDOW = 20_000
 _SEGMENTS = 48  # of all logs in memory: enough to estimate the scatter of their scores
 _CORRELATIONS = 10  # shortest segment, in correlation times of filtered noise
 _SEGMENTS_IN_FILE = 64  # largest number of segments of a log in a file
 _FACTORS = 2**26  # largest size of all their factors [bytes], with at least _FEW segments per log
 _FEW = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """The rows of a piece and their smoothed motion."""
+
+    positions: Array  # (samples, n), as recorded, not unwrapped [rad or m]
+    torques: Array  # (samples, n), as recorded [N m or N]
+    trajectory: Trajectory  # smoothed motion; it may have no samples
+    mask: Array  # (N, n_rows), bool: rows of the motion that are used
+    turned: Array  # (n,), bool: joints whose position was unwrapped
+
+
+@dataclass(frozen=True, eq=False)
+class LogPiece:
+    """A range of rows of a log, with the data for reading it and smoothing it as the whole log."""
+
+    model: RobotModel
+    source: LogLayout | Log  # the log itself if it is in memory
+    signals: SignalSettings
+    log_rows: tuple[int, int]  # the first row of the log, and the row after its last one
+    number: tuple[int, int]  # its number, from 0, and the number of pieces of the log
+    first: int  # its first row
+    stop: int  # the row after its last one
+    span: tuple[int, int]  # first row that is read for it, and the row after the last one
+    near: Place  # position in the file at the start of the span, or shortly before
+    segments: tuple[Segment, ...]  # the uninterrupted segments that contain its rows
+    given: Rows | None = None  # rows that were smoothed before, of a log in memory
+
+    @property
+    def name(self) -> str:
+        """Name for messages, as ``run3.parquet rows 0-16384``."""
+        return f"{Path(self.source.path).name} rows {self.first}-{self.stop}"
+
+    @property
+    def samples(self) -> int:
+        """Number of rows."""
+        return self.stop - self.first
+
+    @property
+    def is_compiled(self) -> bool | None:
+        """Whether compiled code computes the rows of a file: chosen for the log, not by piece."""
+        if isinstance(self.source, Log):
+            return None  # chosen by the number of samples of its one piece
+        first, stop = self.log_rows
+        return choose_engine(self.model, stop - first, None) == COMPILED
+
+    def read(self) -> Rows:
+        """Return its rows and its smoothed motion; for a log in memory they are cached."""
+        return self._cached if isinstance(self.source, Log) else self._read()
+
+    @cached_property
+    def _cached(self) -> Rows:
+        return self.given or self._read()
+
+    def _recorded(self) -> Log:
+        """Return the rows of the span in SI units, angles not unwrapped; in memory, all rows."""
+        if isinstance(self.source, Log):
+            return self.source
+        layout = self.source
+        reader = open_table(Path(layout.path), layout.source).reader(layout.wanted)
+        log = _log_of(layout, reader.read(layout.wanted, *self.span, self.near), self.span[0])
+        return with_contacts(self.model, closed_log(self.model, log), self.signals)
+
+    def _read(self) -> Rows:
+        model, signals, raw = self.model, self.signals, self._recorded()
+        log, first = _unwrap(model, raw), self.span[0]
+        if model.is_static:
+            trajectory, mask = static_rows(model, log, signals)
+        else:
+            own, speeds = slice(self.first, self.stop), friction_speeds(model.layout)
+            trajectory = process_segments(
+                log, self.segments, signals, first=first, own=own, speeds=speeds
+            )
+            mask = row_mask(model, trajectory, signals.min_velocity)
+            trajectory, mask = constrained(model, trajectory, mask, has_torque=log.has_torque)
+        rows = slice(self.first - first, self.stop - first)
+        turned = (log.q != raw.q).any(axis=0)
+        return Rows(raw.q[rows], raw.tau[rows], remember(model, trajectory), mask, turned)
+
+
+def reduce_piece(piece: LogPiece, threads: int | None = None, *, mapping: BaseMapping) -> Reduction:
+    """Return the factors of a piece in base parameters; of no samples if none are usable."""
+    rows = piece.read()
+    problem = base_problem(
+        piece.model, mapping, rows.trajectory, rows.mask, compiled=piece.is_compiled
+    )
+    return Reduction.of(problem, rows.trajectory, threads=threads)
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyedLog:
+    """A surveyed log, which can be read in pieces."""
+
+    model: RobotModel
+    source: LogLayout | Log  # the log if it is in memory, else the columns of its file
+    asked: SignalSettings  # settings of the processing to a trajectory, as given by the user
+    stamps: Array  # (N,), time stamps of all rows of the file [s]
+    first: int  # first row of the log in the file
+    stop: int  # the row after the last one
+    windows: tuple[Log, ...]  # rows that were checked: all, or the first, middle and last ones
+    #: Positions of locked joints in the windows, if the file has them, by name [rad or m].
+    locked: Mapping[str, Array] = field(default_factory=dict)
+    length: int = PIECE  # rows per piece
+    places: Sequence[Place] = (Place(),)  # positions in the file at which blocks of rows start
+    unit: str = ""  # name of the robot, if there are several of one kind
+    given: Rows | None = None  # its rows if it is in memory and they were smoothed before
+
+    @property
+    def path(self) -> str:
+        """Path of the file; "" for a log made in memory."""
+        return self.source.path
+
+    @property
+    def is_in_memory(self) -> bool:
+        return isinstance(self.source, Log)
+
+    @property
+    def head(self) -> Log:
+        """The first rows of the log, with its notes."""
+        log = self.windows[0]
+        if len(self.windows) == 1:
+            return log
+        rows = ", ".join(f"{first}-{stop}" for first, stop in _close_looks(self.first, self.stop))
+        note = f"the log is too long for the memory; the doctor checked rows {rows} only"
+        assumed = dict.fromkeys(text for window in self.windows for text in window.assumed)
+        return replace(log, notes=(*log.notes, note), assumed=tuple(assumed))
+
+    @property
+    def looks(self) -> tuple[Log, ...]:
+        """The windows as separate logs, named by their rows if the log has more rows."""
+        if len(self.windows) == 1:
+            return self.windows
+        ranges = _close_looks(self.first, self.stop)
+        return tuple(
+            replace(log, path=f"{log.path} rows {first}-{stop}", notes=(), assumed=())
+            for log, (first, stop) in zip(self.windows, ranges, strict=True)
+        )
+
+    @cached_property
+    def step(self) -> float:
+        """Median time step [s]."""
+        return median_step(self.stamps[self.first : self.stop])
+
+    @cached_property
+    def signals(self) -> SignalSettings:
+        """Settings of the processing to a trajectory, automatic ones resolved for the whole log."""
+        first = self.windows[0]
+
+        def is_trusted() -> bool:
+            windows = [_unwrap(self.model, log) for log in self.windows]
+            return prefers_measured(self.model, windows, self.asked)
+
+        return decide(
+            self.asked, self.step, self.path or "log",
+            has_velocity=first.v is not None, has_acceleration=first.a is not None,
+            is_trusted=is_trusted,
+        )  # fmt: skip
+
+    @cached_property
+    def segments(self) -> tuple[Segment, ...]:
+        """Its uninterrupted segments."""
+        edges = [self.first]
+        for row, t in blocks_of(self.stamps[self.first : self.stop]):
+            breaks = np.flatnonzero(np.diff(t) > (self.signals.max_gap or np.inf)) + 1
+            edges += (self.first + row + breaks).tolist()
+        return tuple(
+            Segment(i, j, float(self.stamps[i]), float(self.stamps[j - 1]), number)
+            for number, (i, j) in enumerate(pairwise([*edges, self.stop]))
+        )
+
+    def with_model(self, model: RobotModel) -> "SurveyedLog":
+        """Return the log for a robot whose drives have other terms or another load."""
+        layout, given = self.model.layout, None
+        is_alike = np.array_equal(friction_speeds(model.layout), friction_speeds(layout))
+        if self.is_in_memory and is_alike:
+            rows = self.pieces[0].read()
+            motion = rows.trajectory
+            if model.layout != layout or is_loaded(model):
+                motion = remember(model, motion.with_states(None))
+            given = self._rows_of(model, replace(rows, trajectory=motion))
+        return replace(self, model=model, asked=self.signals, given=given)
+
+    def with_torque(self, tau: Array) -> "SurveyedLog":
+        """Return a log in memory with other torques of its smoothed motion, shape (N, n_rows)."""
+        rows = replace(self.whole, trajectory=replace(self.whole.trajectory, tau=tau))
+        return replace(self, given=self._rows_of(self.model, rows))
+
+    def _rows_of(self, model: RobotModel, rows: Rows) -> Rows:
+        """Return rows with those used chosen again, now that they have torques of this robot.
+
+        Static rows were chosen by their speeds already, those of a free base without its jumps and
+        with the forces of its contacts.
+        """
+        if model.is_static or model.constraints or rows.trajectory.switching is not None:
+            return rows
+        mask = row_mask(model, rows.trajectory, self.signals.min_velocity)
+        return replace(rows, mask=mask)
+
+    def with_accelerometer_bias(self, bias: Array) -> "SurveyedLog":
+        """Return the log with another bias of the accelerometers of its IMU: bias (3,) [m/s^2]."""
+
+        def changed(log: Log) -> Log:
+            if log.base is None or log.base.imu is None:
+                return log
+            imu = replace(log.base.imu, frame=replace(log.base.imu.frame, offset=bias))
+            return replace(log, base=replace(log.base, imu=imu))
+
+        source, windows = self.source, tuple(changed(log) for log in self.windows)
+        if isinstance(source, Log):
+            source = changed(source)
+        elif source.base.imu is not None:
+            frame = replace(source.base.imu, offset=bias)
+            source = replace(source, base=replace(source.base, imu=frame))
+        return replace(self, source=source, windows=windows, asked=self.signals, given=None)
+
+    @property
+    def whole(self) -> Rows:
+        """All rows of a log in memory, and their smoothed motion."""
+        (piece,) = self.pieces
+        rows = piece.read()
+        if not len(rows.trajectory.t):
+            raise self.too_short()
+        return rows
+
+    def too_short(self) -> DataError:
+        """Return the error for a log without a segment of sufficient length."""
+        if self.model.is_static:
+            return DataError(
+                f"{self.path or 'log'}: no segment of 0.25 s is slow enough for "
+                "dynamics = 'static'; record poses at rest for at least 1 s each, or slow motion "
+                "at constant speed, or set dynamics = 'full'",
+                code="too_short",
+            )
+        return too_short(self.path or "log", len(self.segments), self.signals)
+
+    @cached_property
+    def pieces(self) -> tuple[LogPiece, ...]:
+        """Its pieces, in order, each with the rows that are read before and after it."""
+        stamps, segments, log_rows = self.stamps, self.segments, (self.first, self.stop)
+        settling, starts = filter_reach(self.signals), [segment.first for segment in segments]
+        pieces, firsts = list[LogPiece](), range(*log_rows, self.length)
+        for number, first in enumerate(firsts):
+            stop = min(first + self.length, self.stop)
+            within = segments[bisect_right(starts, first) - 1 : bisect_right(starts, stop - 1)]
+            before = int(np.searchsorted(stamps, stamps[first] - settling)) - SPLINE
+            after = int(np.searchsorted(stamps, stamps[stop - 1] + settling)) + SPLINE
+            span = max(before, within[0].first), min(after, within[-1].stop)
+            if span[1] - span[0] < 2:  # a single row: add one, a log needs two
+                low = max(span[0] - 1, self.first)
+                span = low, low + 2
+            pieces.append(LogPiece(
+                self.model, self.source, self.signals, log_rows, (number, len(firsts)), first, stop,
+                span, _near(self.places, span[0]), tuple(within), self.given,
+            ))  # fmt: skip
+        return tuple(pieces)
+
+
+def _check_base(model: RobotModel, log: Log) -> None:
+    """Refuse a log without the motion of a floating base, or without a contact of the model."""
+    wanted = logged_base(model)
+    if wanted.floats and log.base is None:
+        raise DataError(
+            f"{log.name} has no pose of the floating base; read it with "
+            "base=BaseColumns(floats=True), or pass Log(..., base=BaseMotion(pose))"
+        )
+    for kind in ("contacts", "wrenches"):
+        logged, names = tuple(getattr(log, kind)), getattr(wanted, kind)
+        stated = tuple(x for x in names if x in logged)  # contacts without flags are found
+        if logged != (stated if kind == "contacts" else names):
+            raise DataError(
+                f"{log.name} has the {kind} {listed(logged)}, wanted those of the model, "
+                f"{listed(names)}, in this order; pass Log(..., {kind}={{...}})"
+            )
+
+
+def hold_log(
+    model: RobotModel, log: Log, signals: SignalSettings, locked: Mapping[str, Array] | None = None
+) -> SurveyedLog:
+    """Return a log in memory as one piece; errors of its data are raised when it is read."""
+    count = len(log.t)
+    _check_base(model, log)
+    log = with_contacts(model, closed_log(model, log), signals)
+    if model.is_static:  # means of segments replace filters
+        signals = replace(
+            signals, cutoff=None, rate=None, velocity="differentiated",
+            acceleration="differentiated",
+        )  # fmt: skip
+    return SurveyedLog(model, log, signals, log.t, 0, count, (log,), locked or {}, count)
+
+
+def survey_log(
+    layout: LogLayout,
+    table: Table,
+    model: RobotModel,
+    signals: SignalSettings,
+    window: tuple[float | None, float | None] = (None, None),
+    *,
+    length: int | None = PIECE,
+) -> SurveyedLog:
+    """Return a surveyed log of a file.
+
+    Every time stamp is checked, units in the windows, the values of a piece when it is read.
+    """
+    locked = {x: layout.positions[x] for x in model.locked if x in layout.positions}
+    wanted = list(dict.fromkeys([*layout.wanted, *locked.values()]))
+    if length is None:
+        whole = table.read(wanted)
+        log = layout.to_log(whole)
+        check_units(log, layout.units, layout.prismatic, layout.turning)
+        used = log if window == (None, None) else log.window(*window)
+        inside = slice(*np.searchsorted(log.t, [used.t[0], np.nextafter(used.t[-1], np.inf)]))
+        positions = _positions(locked, [whole], layout, model, inside)
+        return hold_log(model, used, signals, positions)
+    reader, places, where = table.reader(wanted), list[Place](), Path(layout.path).name
+    stamps = map_stamps(_stamps(reader, layout, places), where)
+    first, stop = _window(stamps, where, *window)
+    ranges = _close_looks(first, stop)
+    columns = [reader.read(wanted, i, j, _near(places, i)) for i, j in ranges]
+    windows = tuple(_log_of(layout, x, i) for x, (i, _) in zip(columns, ranges, strict=True))
+    layout, windows = _with_one_bias(layout, windows)
+    for log in windows:
+        check_units(log, layout.units, layout.prismatic, layout.turning)
+    positions = _positions(locked, columns, layout, model)
+    if table.rows is None:
+        length = max(stop - first, 1)
+    windows = tuple(with_contacts(model, closed_log(model, log), signals) for log in windows)
+    return SurveyedLog(
+        model, layout, signals, stamps, first, stop, windows, positions, length, places
+    )
+
+
+def _with_one_bias(
+    layout: LogLayout, windows: tuple[Log, ...]
+) -> tuple[LogLayout, tuple[Log, ...]]:
+    """Return layout and windows with the bias of the gyroscopes at rest in all windows together."""
+    bases = [(log.base, log.base.imu) for log in windows if log.base and log.base.imu]
+    if layout.base.imu is None or layout.base.imu.bias is not None or not bases:
+        return layout, windows
+    parts = [
+        (log.t, log.q, imu.values[:, :3] + imu.frame.bias)
+        for log, (_, imu) in zip(windows, bases, strict=True)
+    ]
+    bias, note = bias_at_rest(parts)
+    frame, changed = replace(bases[0][1].frame, bias=bias), []
+    for part, log, (base, imu) in zip(parts, windows, bases, strict=True):
+        values = np.hstack([part[2] - bias, imu.values[:, 3:]])
+        imu = replace(imu, values=values, frame=frame)
+        note_of_window = bias_at_rest([part])[1]
+        notes = tuple(note if x == note_of_window else x for x in log.notes)
+        changed.append(replace(log, base=replace(base, imu=imu), notes=notes))
+    return replace(layout, base=replace(layout.base, imu=frame)), tuple(changed)
+
+
+def _log_of(layout: LogLayout, columns: Mapping[str, Array], first: int) -> Log:
+    """Return rows of a file as a log in SI units, angles not unwrapped."""
+    log = layout.to_log(columns, first)
+    check_reach(log, layout.units, layout.prismatic, layout.turning)
+    return log
+
+
+def _unwrap(model: RobotModel, log: Log) -> Log:
+    """Return the log with unwrapped angles."""
+    return unwrap(log, np.array([joint.turns_freely for joint in model.limits]))
+
+
+def _stamps(rows: RowReader, layout: LogLayout, places: list[Place]) -> Iterator[Array]:
+    """Yield the time stamps in seconds, and store the place of each block of rows."""
+    for values, place in rows.scan(layout.columns["time"][0]):
+        places.append(place)
+        yield layout.stamps(values)
+
+
+def _near(places: Sequence[Place], row: int) -> Place:
+    return places[max(bisect_right(places, row, key=lambda place: place.row) - 1, 0)]
+
+
+def _window(stamps: Array, where: str, start: float | None, end: float | None) -> tuple[int, int]:
+    """Return the rows from start to end; see ``Log.window``."""
+    count = len(stamps)
+    if count < 2:
+        raise DataError(f"{where} has {count} rows, wanted at least 2")
+    first = 0 if start is None else int(np.searchsorted(stamps, start))
+    stop = count if end is None else int(np.searchsorted(stamps, end, side="right"))
+    if stop - first < 2:
+        low, high = stamps[0], stamps[-1]
+        raise DataError(
+            f"{where}: {max(stop - first, 0)} rows lie between "
+            f"{seconds(low if start is None else start)} s and "
+            f"{seconds(high if end is None else end)} s; the log spans {seconds(low)} s to "
+            f"{seconds(high)} s. Choose start and end inside it"
+        )
+    return first, stop
+
+
+def _close_looks(first: int, stop: int) -> list[tuple[int, int]]:
+    """Return the ranges of the first, middle and last rows; one range if the log is short."""
+    if stop - first <= 3 * WINDOW:
+        return [(first, stop)]
+    middle = (first + stop - WINDOW) // 2
+    return [(row, row + WINDOW) for row in (first, middle, stop - WINDOW)]
+
+
+def _positions(
+    names: Mapping[str, str],
+    windows: Sequence[Mapping[str, Array]],
+    layout: LogLayout,
+    model: RobotModel,
+    inside: slice = slice(None),
+) -> dict[str, Array]:
+    """Return the positions of locked joints in the rows read, by joint [rad or m]."""
+    revolute = {joint.name for joint in model.tree.movable if joint.type != "prismatic"}
+    positions = {}
+    for joint, column in names.items():
+        q = np.concatenate([columns[column] for columns in windows])[inside]
+        q = q[np.isfinite(q)]
+        first, scale = layout.units.scale(joint, is_angle=joint in revolute)
+        if len(q):
+            positions[joint] = first + scale * q
+    return positions
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +496,9 @@ class RepeatedErrors:
     @property
     def described(self) -> str:
         """Description of the errors."""
-        points = f"points of contact uncertain by {self.points:.2g} m"
-        parts = [points] if self.points > 0.0 else []
+        parts = []
+        if self.points > 0.0:
+            parts.append(f"points of contact uncertain by {self.points:.2g} m")
         if self.bias is not None:
             shown = ", ".join(f"{x:+.3f}" for x in self.bias)
             parts.append(
@@ -79,9 +538,9 @@ class Recordings:
         return min(independent_share(log.signals) for log in self.fitted)
 
     @property
-    def pieces(self) -> list[ReducedPiece]:
+    def pieces(self) -> list[LogPiece]:
         """The pieces of the logs to fit, in order."""
-        return [ReducedPiece(piece, self.mapping) for log in self.fitted for piece in log.pieces]
+        return [piece for log in self.fitted for piece in log.pieces]
 
     def with_model(self, model: RobotModel) -> "Recordings":
         """Return the same logs for a robot whose drives have other terms or another load."""
@@ -105,61 +564,48 @@ class Recordings:
             for log in (*self.fitted, *self.validation):  # raises errors before any fit
                 keep_inertial_rows(self.model, log.whole.trajectory)
             reduced = self._segments if is_cut else self._whole
-            return tuple(tuple(reduced(k)) for k in range(len(self.fitted)))
-        plan = self.plan or WorkPlan()
-        found = plan.map(ReducedPiece.reduce, self.pieces, "reducing")
-        reductions = []
+            return tuple(
+                tuple(reduced(k, log.whole.trajectory)) for k, log in enumerate(self.fitted)
+            )
+        work = partial(reduce_piece, mapping=self.mapping)
+        by_piece = (self.plan or WorkPlan()).map(work, self.pieces, "reducing")
         size = 8 * self.model.n_rows * (len(self.mapping.independent) + 1) ** 2 * len(self.fitted)
         most = max(_FEW, min(_SEGMENTS_IN_FILE, _FACTORS // size))
+        reductions = []
         for log in self.fitted:
             count = len(log.pieces)
-            own = join_segments(islice(found, count), count, most)
-            if not any(reduction.samples for reduction in own):
+            segments = join_segments(islice(by_piece, count), count, most)
+            if not any(reduction.samples for reduction in segments):
                 raise log.too_short()
-            reductions.append(tuple(own))
+            reductions.append(tuple(segments))
         return tuple(reductions)
 
-    def problem(self, *, with_mass: bool = False) -> Problem:
+    def problem(self) -> Problem:
         """Return the rows of the logs to fit, for estimators that read them in order of time."""
+        model, mapping = self.model, self.mapping
         if self.is_in_memory:
             motions = [log.whole.trajectory for log in self.fitted]
-            return concatenate([self.problem_of(k, x, with_mass) for k, x in enumerate(motions)])
-
-        def problems() -> Iterator[Problem]:
-            for piece in (piece for log in self.fitted for piece in log.pieces):
-                rows = piece.read()
-                yield base_problem(
-                    self.model, self.mapping, rows.trajectory, rows.mask, with_mass=with_mass
-                )
+            return concatenate([self.problem_of(k, motion) for k, motion in enumerate(motions)])
 
         def stream() -> Iterator[Block]:
-            return chain.from_iterable(problem.blocks() for problem in problems())
+            for rows in (piece.read() for piece in self.pieces):
+                yield from base_problem(model, mapping, rows.trajectory, rows.mask).blocks()
 
-        def mass_stream() -> Iterator[Array]:
-            for problem in problems():
-                yield from problem.mass_stream() if problem.mass_stream is not None else ()
-
-        support, is_projected = self.model.support, bool(self.model.constraints)
+        support, is_projected = model.support, bool(model.constraints)
         if is_projected:  # every row has the columns of all
             support = np.broadcast_to(support.any(axis=0), support.shape)
-        return Problem(
-            stream,
-            self.mapping.base_names,
-            self.model.n_rows,
-            support[:, self.mapping.independent],
-            mass_stream if with_mass else None,
-            is_projected=is_projected,
-        )
+        names, support = mapping.base_names, support[:, mapping.independent]
+        return Problem(stream, names, model.n_rows, support, is_projected=is_projected)
 
     def segments(self, k: int, motion: Trajectory, joined: int = 1) -> tuple[Factors, ...]:
         """The factors of each segment of a log in memory, with the segments of ``reduce``."""
         return compress_segments(self.problem_of(k, motion), joined * self.segment_length(k))
 
-    def problem_of(self, k: int, motion: Trajectory, with_mass: bool = False) -> Problem:
+    def problem_of(self, k: int, motion: Trajectory) -> Problem:
         """Return the weighted rows of a log in memory for a motion of the same length."""
         mask = self.fitted[k].whole.mask
         weight = mask if self.weights is None else mask * self.weights[k]
-        return base_problem(self.model, self.mapping, motion, weight, with_mass=with_mass)
+        return base_problem(self.model, self.mapping, motion, weight)
 
     def segment_length(self, k: int) -> int:
         """Return the samples of each segment of a log in memory."""
@@ -169,14 +615,13 @@ class Recordings:
             shortest = 1
         return max(-(-samples // count), shortest)
 
-    def _segments(self, k: int) -> Iterator[Reduction]:
+    def _segments(self, k: int, motion: Trajectory) -> Iterator[Reduction]:
         """Yield the reduction of each segment of a log in memory."""
-        motion, length = self.fitted[k].whole.trajectory, self.segment_length(k)
+        length = self.segment_length(k)
         for i, factors in enumerate(self.segments(k, motion)):
             part = motion.at(slice(i * length, (i + 1) * length))
             yield Reduction(factors, part.squares, len(part.t))
 
-    def _whole(self, k: int) -> Iterator[Reduction]:
+    def _whole(self, k: int, motion: Trajectory) -> Iterator[Reduction]:
         """Yield the reduction of a log in memory."""
-        motion = self.fitted[k].whole.trajectory
         yield Reduction.of(self.problem_of(k, motion), motion)

@@ -12,15 +12,14 @@ s(theta) = W^T S^-1 (tau - W theta):
     D theta = s(theta) - mean over e of [s_{+e}(theta) + s_{-e}(theta)] / 2
 
 The eigenvalues x of D relative to H are the shares of noise in the information along the
-eigenvectors. Along each of them the correction is a factor of 1 / (1 - x). D is estimated with an
-error, so directions that contain only noise cannot be corrected: x is limited by a bound, and the
-error of D is counted as an error of the estimate. The correction amplifies errors by the same
-factor. The bias varies over a log, so the scatter of the segments is also larger by about this
-factor; it is used as it is (coverages: docs/explanation/intervals.md).
+eigenvectors. Along each of them the correction is a factor of 1 / (1 - x), which amplifies errors
+likewise. Directions that contain only noise cannot be corrected: x is limited by a bound, and the
+error of D is counted as an error of the estimate. The bias varies over a log, so the scatter of the
+segments is also larger by about this factor (coverages: docs/explanation/intervals.md).
 
 The part linear in e, [s_{+e} - s_{-e}] / 2, is the noise of the score due to the encoder. If a
-motion is repeated, its rounding errors are repeated, and the segments of the log scatter less than
-their sum. The difference is added to the covariance of the score.
+motion repeats, so do its rounding errors, and the segments of the log scatter less than their sum.
+The difference is added to the covariance of the score.
 
 References:
     Carroll, Ruppert, Stefanski, Crainiceanu (2006), Measurement Error in Nonlinear Models, chapters
@@ -33,14 +32,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import local_polynomial
 from robotid.data.units import quantum
-from robotid.dynamics.factors import Factors, Reduction
+from robotid.dynamics.factors import Reduction
 from robotid.estimation.estimators.batch import solve_factor
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import SurveyedLog, hold_log
+from robotid.estimation.fitting.recorded import WINDOW, Recordings, SurveyedLog, hold_log
 
 _FEWEST, _MOST = 4, 6  # pairs of rounding errors
 _PRECISE = 0.2  # uncertainty of the shift in standard errors at which no more pairs are drawn
@@ -49,7 +46,6 @@ _SHARE_ERROR = 0.1  # relative standard error of a share of noise
 _MATTERS = 0.1  # shift of the parameters in standard errors below which nothing is corrected
 _CUBIC = 5  # smallest number of rows on each side for smoothing
 _JOINED = 4  # segments that are joined into one, for speed
-_ROWS = 20_000  # rows of a log in which the step of its positions is searched
 _FREQUENCIES = 2048  # frequencies at which the noise of an acceleration is summed
 
 
@@ -60,9 +56,7 @@ class RegressorNoise:
     #: (n,), largest quantisation step of each joint's position in the logs [rad or m]; 0: none, or
     #: without effect because velocities are measured.
     steps: Array
-    #: (n,), RMS of the quantisation noise of each acceleration, over the RMS of the acceleration
-    #: [-].
-    share: Array
+    share: Array  # (n,), RMS of the quantisation noise of each acceleration over its RMS [-]
     shift: Array  # (b,), bias of the base parameters, E[theta_ls] - theta
     #: (b,), standard errors of the base parameters by residual and filter, without the
     #: quantisation; inf if not identifiable.
@@ -70,14 +64,10 @@ class RegressorNoise:
     #: (b, b), covariance of the score that the scatter of segments does not include: of repeated
     #: rounding errors and of the shift.
     meat: Array
-    #: Whether the estimate is corrected; if not, its covariance includes the shift.
-    is_corrected: bool = True
+    is_corrected: bool = True  # if the estimate is not corrected, its covariance has the shift
 
     def uncorrected(self, information: Array) -> "RegressorNoise":
-        """Return the same with the shift counted as an error instead of corrected.
-
-        information (b, b).
-        """
+        """Return the same with the shift counted as an error instead: information (b, b)."""
         score = information @ self.shift
         return replace(self, meat=self.meat + np.outer(score, score), is_corrected=False)
 
@@ -87,7 +77,7 @@ def find_regressor_noise(
 ) -> RegressorNoise | None:
     """Return the effect of position quantisation on least squares; None if it is negligible.
 
-    theta (b,), sigma (n_rows,) [N m or N], level (n_rows,) [N m or N].
+    theta (b,), of weights by sigma (n_rows,) [N m or N], of rows of the noise level (n_rows,).
     """
     model, factors, weights = recordings.model, whole.factors, 1.0 / sigma**2
     if model.is_static or model.free_flyer:
@@ -101,7 +91,7 @@ def find_regressor_noise(
     if share.max() ** 2 * size < _MATTERS:
         return None
     near = _without_steps(near, steps)
-    plain = _sums(near, [log.whole.trajectory for log in near.fitted], theta, weights)
+    plain = _sums(near, near.fitted, theta, weights)
     scale = float(factors.rows.sum() / plain.rows)  # all rows over those in memory
     bread = solve_factor(factors, sigma, theta).covariance
     variance = np.diag(bread @ factors.information((level * weights) ** 2) @ bread)
@@ -110,7 +100,13 @@ def find_regressor_noise(
     rng, pairs = np.random.default_rng(0), list[tuple[_Sums, _Sums]]()
     is_enough = False
     while not is_enough:
-        pairs.append(_pair(near, steps, theta, weights, rng))
+        logs = zip(near.fitted, steps, strict=True)
+        errors = [rounding_errors(log.head.q, step, rng) for log, step in logs]
+        more, less = (
+            _sums(near, list(map(_shifted, near.fitted, changes)), theta, weights)
+            for changes in (errors, [-e for e in errors])
+        )
+        pairs.append((more, less))
         draws = np.array([plain.score - 0.5 * (one.score + two.score) for one, two in pairs])
         is_enough = _is_enough(scale * draws @ bread / error)
     if len(pairs) < _FEWEST:
@@ -119,40 +115,34 @@ def find_regressor_noise(
     D, D_theta = scale * (D - plain.information), scale * draws.mean(axis=0)
     root, move, error_of_move = without_noise(bread, D, D_theta)
     linear = np.array([0.5 * (one.segments - two.segments) @ root for one, two in pairs])
+    # segments with the same rounding errors do not scatter, but their errors add up
+    repeated = np.mean(linear.sum(axis=1) ** 2 - (linear**2).sum(axis=1), axis=0)  # (b,)
     along = factors.information(weights) @ root  # change of the score per move along a direction
-    meat = (along * (scale * _repeated(linear) + error_of_move**2)) @ along.T
+    meat = (along * (scale * np.maximum(repeated, 0.0) + error_of_move**2)) @ along.T
     meat = meat + scale**2 * np.cov(draws.T) / len(draws)
-    shift = -root @ move
-    return RegressorNoise(np.max(steps, axis=0), share, shift, error, meat)
+    return RegressorNoise(np.max(steps, axis=0), share, -root @ move, error, meat)
 
 
 def smoothed(q: Array, steps: Array, width: int) -> Array:
-    """Return the change that removes most of the quantisation of positions, shape (N, n).
+    """Return the change that removes most of the quantisation of positions q, shape (N, n).
 
     A cubic polynomial is fitted to the rows around each sample; the change is at most one step.
-
-    q (N, n) [rad or m], steps (n,) [rad or m].
     """
     rows = (len(q) - 1) // 2 * 2 + 1
     smooth = local_polynomial(q, min(width, rows), min(3, rows - 1))
-    change: Array = np.clip(smooth - q, -steps, steps)
-    return change
+    return np.asarray(np.clip(smooth - q, -steps, steps))
 
 
 def rounding_errors(q: Array, steps: Array, rng: np.random.Generator) -> Array:
-    """Return rounding errors of encoders with random zeros, shape (N, n) [rad or m].
-
-    q (N, n) [rad or m], steps (n,) [rad or m].
-    """
+    """Return rounding errors of encoders with random zeros at positions q, shape (N, n)."""
     count = q / np.where(steps > 0, steps, 1.0) + rng.random(q.shape[1])
-    errors: Array = (np.round(count) - count) * steps
-    return errors
+    return np.asarray((np.round(count) - count) * steps)
 
 
 def without_noise(bread: Array, D: Array, D_theta: Array) -> tuple[Array, Array, Array]:
-    """Return (H - D)^-1 D theta along directions in which H and D are diagonal.
+    """Return directions (b, b) in which H and D are diagonal, the move and its error (b,).
 
-    bread (b, b), D (b, b), D_theta (b,) -> (b, b), (b,), (b,).
+    The move along them is (H - D)^-1 D theta; the bread is H^-1.
     """
     size, axes = np.linalg.eigh(bread)
     root = axes * np.sqrt(np.maximum(size, 0.0))
@@ -189,51 +179,24 @@ class _Sums:
     @property
     def score(self) -> Array:
         """Score of all rows, shape (b,)."""
-        total: Array = self.segments.sum(axis=0)
-        return total
+        return np.asarray(self.segments.sum(axis=0))
 
 
 def _is_enough(moves: Array) -> bool:
-    """Return whether the shift of the parameters is known precisely, or is negligible.
-
-    moves (k, b).
-    """
+    """Return whether the shift of the parameters by pairs (k, b) is precise, or negligible."""
     count = len(moves)
     if count < _FEWEST:
         return bool((np.abs(moves.mean(axis=0)) < _MATTERS).all())
     return count >= _MOST or bool((moves.std(axis=0, ddof=1) <= _PRECISE * np.sqrt(count)).all())
 
 
-def _sums(near: Recordings, motions: Sequence[Trajectory], theta: Array, weights: Array) -> _Sums:
-    """Return the sums over the rows of the logs in memory, for other motions."""
-    segments, rows = list[Array](), 0
-    information = np.zeros((len(theta), len(theta)))
-    for k, motion in enumerate(motions):
-        factors: Factors
-        for factors in near.segments(k, motion, _JOINED):
-            segments.append(factors.score(theta, weights))
-            information += factors.information(weights)
-            rows += int(factors.rows.sum())
-    return _Sums(np.array(segments), information, rows)
-
-
-def _pair(
-    near: Recordings,
-    steps: Sequence[Array],
-    theta: Array,
-    weights: Array,
-    rng: np.random.Generator,
-) -> tuple[_Sums, _Sums]:
-    """Return the sums over the rows with rounding errors added, and subtracted."""
-    logs = zip(near.fitted, steps, strict=True)
-    errors = [rounding_errors(log.head.q, own, rng) for log, own in logs]
-
-    def summed(sign: float) -> _Sums:
-        pairs = zip(near.fitted, errors, strict=True)
-        motions = [_shifted(log, sign * e).whole.trajectory for log, e in pairs]
-        return _sums(near, motions, theta, weights)
-
-    return summed(1.0), summed(-1.0)
+def _sums(near: Recordings, logs: Sequence[SurveyedLog], theta: Array, weights: Array) -> _Sums:
+    """Return the sums over the rows of the logs in memory, for the motions of other ones."""
+    motions = [log.whole.trajectory for log in logs]
+    parts = [part for k, motion in enumerate(motions) for part in near.segments(k, motion, _JOINED)]
+    information = np.sum([part.information(weights) for part in parts], axis=0)
+    rows = sum(int(part.rows.sum()) for part in parts)
+    return _Sums(np.array([part.score(theta, weights) for part in parts]), information, rows)
 
 
 def _shifted(log: SurveyedLog, change: Array) -> SurveyedLog:
@@ -248,57 +211,36 @@ def _without_steps(near: Recordings, steps: Sequence[Array]) -> Recordings:
     Added rounding errors then do not interact with those of the recorded positions.
     """
     logs = []
-    for log, own in zip(near.fitted, steps, strict=True):
+    for log, step in zip(near.fitted, steps, strict=True):
         period = 1.0 / ((log.signals.cutoff or np.inf) * log.step)  # [rows], of the filter
         width = 2 * max(_CUBIC, round(period)) + 1
         is_prismatic = np.isin(log.model.joints, list(log.model.layout.prismatic))
         q = np.where(is_prismatic, log.head.q, np.unwrap(log.head.q, axis=0))
-        logs.append(_shifted(log, smoothed(q, own, width)))
+        logs.append(_shifted(log, smoothed(q, step, width)))
     return replace(near, fitted=logs, validation=())
-
-
-def _repeated(linear: Array) -> Array:
-    """Return the variance of the score along each direction due to repeated errors, shape (b,).
-
-    Segments with the same rounding errors do not scatter, but their errors add up.
-
-    linear (k, s, b).
-    """
-    total, scattered = linear.sum(axis=1) ** 2, (linear**2).sum(axis=1)
-    more: Array = np.maximum(np.mean(total - scattered, axis=0), 0.0)
-    return more
 
 
 def _in_memory(recordings: Recordings) -> Recordings:
     """Return the fitted logs in memory; for logs in files, their windows in memory."""
-    if all(log.is_in_memory for log in recordings.fitted):
+    logs = recordings.fitted
+    if all(log.is_in_memory for log in logs):
         return recordings
-    windows = [
-        hold_log(log.model, window, log.signals)
-        for log in recordings.fitted
-        for window in log.looks
-    ]
+    windows = [hold_log(log.model, look, log.signals) for log in logs for look in log.looks]
     usable = [log for log in windows if len(log.pieces[0].read().trajectory.t)]
     return replace(recordings, fitted=usable, validation=(), plan=None)
 
 
 def _steps(log: SurveyedLog) -> Array:
-    """Return the quantisation steps of the positions of a log in memory, shape (n,).
-
-    They are 0 if velocities are measured.
-    """
+    """Return the quantisation steps of a log's positions, (n,); 0 if velocities are measured."""
     if log.signals.velocity == "measured":
         return np.zeros(len(log.model.joints))
-    return np.array([quantum(x, repeats=False) for x in log.head.q[:_ROWS].T])
+    return np.array([quantum(x, repeats=False) for x in log.head.q[:WINDOW].T])
 
 
 def _share(logs: Sequence[SurveyedLog], steps: Sequence[Array], whole: Reduction) -> Array:
     """Return the quantisation noise of each acceleration over its RMS, at most 1, shape (n,)."""
-    noise = [
-        own / np.sqrt(12.0) * acceleration_noise(log.step, log.signals)
-        for log, own in zip(logs, steps, strict=True)
-    ]
-    own = np.sqrt(whole.squares[2] / max(whole.samples, 1))
-    largest = np.max(noise, axis=0)
-    share: Array = np.where(own > 0, largest / np.where(own > 0, own, 1.0), 0.0)
-    return np.minimum(share, 1.0)
+    gains = [acceleration_noise(log.step, log.signals) for log in logs]
+    noise = np.max(np.array(gains)[:, None] * steps / np.sqrt(12.0), axis=0)
+    rms = np.sqrt(whole.squares[2] / max(whole.samples, 1))
+    share = np.divide(noise, rms, out=np.zeros_like(noise), where=rms > 0)
+    return np.asarray(np.minimum(share, 1.0))

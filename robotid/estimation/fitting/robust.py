@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -45,33 +44,27 @@ class Outlier:
 def loss_weight(loss: str, r: Array) -> Array:
     """Return the weights psi(r) / r of rows in the equivalent least squares problem, 0 to 1.
 
-    References:
-        Huber (1964), Robust estimation of a location parameter; Beaton, Tukey (1974), The fitting
-        of power series.
+    Huber (1964), Robust estimation of a location parameter; Beaton, Tukey (1974), The fitting of
+    power series.
     """
     size, bound = np.abs(r), LOSSES[loss]
     if loss == "huber":
-        weight: Array = bound / np.maximum(size, bound)
-        return weight
-    weight = np.maximum(1.0 - (size / bound) ** 2, 0.0) ** 2
-    return weight
+        return np.asarray(bound / np.maximum(size, bound))
+    return np.asarray(np.maximum(1.0 - (size / bound) ** 2, 0.0) ** 2)
 
 
 def loss_slope(loss: str, r: Array) -> Array:
     """Return psi'(r), the derivative of the loss's influence function, at most 1."""
     u = (r / LOSSES[loss]) ** 2
-    slope: Array = np.where(u < 1.0, 1.0 if loss == "huber" else (1.0 - u) * (1.0 - 5.0 * u), 0.0)
-    return slope
+    return np.where(u < 1.0, 1.0 if loss == "huber" else (1.0 - u) * (1.0 - 5.0 * u), 0.0)
 
 
 def reweigh(recordings: Recordings, loss: str, prior: Array) -> tuple[Recordings, float]:
-    """Downweight rows with large residuals until the fit converges.
+    """Downweight rows with large residuals until the fit converges: prior (p,).
 
     The scale of each joint's residual is its median absolute deviation, which outliers hardly
     change. "tukey", which gives outliers a weight of 0, starts from the result of "huber", whose
     minimum is unique.
-
-    prior (p,).
     """
     if not recordings.is_in_memory:
         raise SettingsError(
@@ -101,52 +94,51 @@ def reweigh(recordings: Recordings, loss: str, prior: Array) -> tuple[Recordings
     used = np.concatenate([log.whole.mask.ravel() for log in recordings.fitted])
     scaled = np.concatenate([r.ravel() for r in residuals])[used]
     weight = loss_weight(loss, scaled)
-    slope = max(float(loss_slope(loss, scaled).mean()), 1e-3)
+    slope = float(loss_slope(loss, scaled).mean())  # >= 0.03: half of the rows are below 0.7
     return weighted, float(weight.mean()) / slope
 
 
 def find_outliers(
     model: RobotModel, evaluations: Sequence[Evaluation], standard: Array
 ) -> tuple[Outlier, ...]:
-    """Return the rows with very large residuals, the largest first.
+    """Return the rows with very large residuals, the largest first: standard (p,).
 
     Near a reversal an error of the size of the step of Coulomb friction is also accepted: during
     stiction the friction torque can have any value between its two bounds, and a joint that stops
     reverses in the filtered motion. A reversal is near if the filtered velocity has it within
     1 / cutoff [s], or would have it at the sample's acceleration.
-
-    standard (p,).
     """
-    found: list[Outlier] = []
+    outliers: list[Outlier] = []
     step = _friction_step(model, standard)
     for e in evaluations:
         motion, mask, prediction = e.recording.trajectory, e.recording.mask, e.torques["estimate"]
-        scales = _scales([motion.tau - prediction], [mask])
+        error = np.abs(motion.tau - prediction)
         near = 1.0 / (e.recording.signals.cutoff or np.inf)  # [s]
         reverses = (np.abs(motion.v) <= near * np.abs(motion.a)) | _is_reversed(motion, near)
-        excess = np.abs(motion.tau - prediction) - np.where(reverses, step, 0.0)
+        excess = error - np.where(reverses, step, 0.0)
         rms = np.sqrt(np.mean(motion.tau**2, axis=0))
-        sizes = np.where(excess >= _MATTERS * rms, excess / scales, 0.0)
+        sizes = np.where(excess >= _MATTERS * rms, excess / _scales([error], [mask]), 0.0)
+        log = Path(e.recording.log.path).name or "log"
         for j, joint in enumerate(model.row_names):
             rows = np.flatnonzero((sizes[:, j] >= _OUTLIER) & mask[:, j])
             edges = np.flatnonzero(np.diff(motion.t[rows]) > _NEAR) + 1
-            for i, k in pairwise([0, *edges.tolist(), len(rows)] if len(rows) else []):
-                worst = rows[i:k][np.argmax(sizes[rows[i:k], j])]
-                log, at = Path(e.recording.log.path).name or "log", float(motion.t[worst])
-                tau, wanted, size = (float(x[worst, j]) for x in (motion.tau, prediction, sizes))
-                found.append(Outlier(log, joint, at, tau, wanted, size, k - i))
-    return tuple(sorted(found, key=lambda outlier: -outlier.size))
+            for close in np.split(rows, edges) if len(rows) else ():
+                k = close[np.argmax(sizes[close, j])]
+                tau, wanted, size = (float(x[k, j]) for x in (motion.tau, prediction, sizes))
+                t = float(motion.t[k])
+                outliers.append(Outlier(log, joint, t, tau, wanted, size, len(close)))
+    return tuple(sorted(outliers, key=lambda outlier: -outlier.size))
 
 
 def _is_reversed(motion: Trajectory, near: float) -> Array:
     """Return whether each velocity changes its sign within a time, before or after a sample."""
-    t, found = motion.t, np.zeros(motion.v.shape, dtype=bool)
+    t, is_near = motion.t, np.zeros(motion.v.shape, dtype=bool)
     within = (np.diff(motion.segment) == 0)[:, None]
     for j, changes in enumerate((within & (motion.v[1:] * motion.v[:-1] < 0.0)).T):
-        at = t[np.flatnonzero(changes)]  # of the sample before the change, the other one follows
-        after = t[np.flatnonzero(changes) + 1]
-        found[:, j] = np.searchsorted(at, t + near, side="right") > np.searchsorted(after, t - near)
-    return found
+        before, after = t[:-1][changes], t[1:][changes]  # times of the samples around the change
+        started = np.searchsorted(before, t + near, side="right")
+        is_near[:, j] = started > np.searchsorted(after, t - near)
+    return is_near
 
 
 def _friction_step(model: RobotModel, standard: Array) -> Array:
@@ -171,12 +163,11 @@ def _scaled_residuals(recordings: Recordings, standard: Array) -> list[Array]:
 
 
 def _scales(residuals: Sequence[Array], masks: Sequence[Array]) -> Array:
-    """Return the scale of each joint's residual from its median absolute value."""
-    scales = []
-    for j in range(residuals[0].shape[1]):
-        used = [r[mask[:, j], j] for r, mask in zip(residuals, masks, strict=True)]
-        together = np.concatenate(used)
-        scales.append(_MAD * float(np.median(np.abs(together))) if len(together) else np.inf)
+    """Return the scale of each joint's residual from its median absolute value, (n_rows,)."""
+    size, mask = np.abs(np.concatenate(residuals)), np.concatenate(masks)
+    scales = [
+        _MAD * float(np.median(column[used])) if used.any() else np.inf
+        for column, used in zip(size.T, mask.T, strict=True)
+    ]
     # residuals of rounding size, of noise-free data, contain no outliers
-    torque = max(float(np.abs(r).max()) for r in residuals)
-    return np.maximum(scales, max(1e-9 * torque, 1e-300))
+    return np.maximum(scales, max(1e-9 * float(size.max()), 1e-300))

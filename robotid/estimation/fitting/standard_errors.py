@@ -19,7 +19,12 @@ from robotid.dynamics.factors import Factors
 from robotid.dynamics.torque import trajectory_regressor
 from robotid.estimation.estimators import Consistent, Estimate
 from robotid.estimation.estimators.batch import solve_factor
-from robotid.estimation.estimators.estimator import FEWEST_SEGMENTS, quantile, scatter
+from robotid.estimation.estimators.estimator import (
+    FEWEST_SEGMENTS,
+    quantile,
+    sandwich,
+    scatter,
+)
 from robotid.robot.model import RobotModel
 
 _DRAWS = 64  # fits to resampled data and prior, for standard errors with active bounds
@@ -64,7 +69,7 @@ def measured_errors(
     """Return an estimate with its covariance from the scatter of the segments.
 
     With the bread B, the covariance if rows were independent, and the meat M, the covariance of the
-    score:
+    score, ``more`` (b, b) included:
 
     * base parameters: B M B, as for any least squares with correlated rows;
     * standard parameters: B (K^T M K + g L) B with B = (K^T H K + L)^-1. L is the precision of the
@@ -74,53 +79,44 @@ def measured_errors(
       they are neglected;
     * a filter with forgetting: its own covariance times the mean inflation.
 
-    estimate (b,), K (b, p), sigma (n,) [N m or N], more (b, b).
+    Too few segments have no scatter: the meat is that of a share of independent rows.
     """
-    b = len(factors.names)
-    if not estimate.details.get("active"):
-        bounded = None
+    b, is_open = len(factors.names), ~np.isfinite(np.diag(estimate.covariance))
+    C = np.where(np.isfinite(estimate.covariance), estimate.covariance, 0.0)
+    R, more = factors.weighted(sigma)[:b, :b], np.zeros((b, b)) if more is None else more
+    is_standard = len(estimate.theta) != b
+    bounded = bounded if estimate.details.get("active") else None
     if len(segments) < FEWEST_SEGMENTS:
-        method = (
+        errors = StandardErrors(
             f"the bandwidth of the filter: a share of {share:.3g} of the rows is assumed to be "
             f"independent, because the logs have only {len(segments)} segments longer than the "
-            "correlation time of the filter"
-        )
-        errors = StandardErrors(method, len(segments), 1 / share, np.full(b, np.inf))
-        R = factors.weighted(sigma)[:b, :b]
-        meat = share * R.T @ R + (0.0 if more is None else share**2 * more)
+            "correlation time of the filter",
+            len(segments), 1 / share, np.full(b, np.inf),
+        )  # fmt: skip
+        meat, weight_ratio = R.T @ R / share + more, max(weight_ratio, 1.0)
         if bounded is not None:
-            return _redrawn(estimate, errors, bounded, factors, sigma, meat)
-        if len(estimate.theta) != b and (weight_ratio > 1.0 or more is not None):
-            C = about_prior(estimate.covariance, K, meat, R, share, max(weight_ratio, 1.0))
-            estimate = replace(estimate, covariance=C)
-        elif more is not None:
-            C = np.where(np.isfinite(estimate.covariance), estimate.covariance, 0.0)
-            estimate = replace(estimate, covariance=estimate.covariance + share**2 * C @ more @ C)
-        return estimate, errors
-    is_open = ~np.isfinite(np.diag(estimate.covariance))
-    C = np.where(np.isfinite(estimate.covariance), estimate.covariance, 0.0)
-    if len(estimate.theta) != b:
-        found = scatter(segments, K @ estimate.theta, sigma, share * K @ C @ K.T)
-        found = found if more is None else replace(found, meat=found.meat + more)
-        R = factors.weighted(sigma)[:b, :b]
-        covariance = about_prior(C, K, share**2 * found.meat, R, share, weight_ratio)
-    elif not is_filter:
-        bread = solve_factor(factors, sigma, estimate.theta).covariance
-        found = scatter(segments, estimate.theta, sigma, bread)
-        found = found if more is None else replace(found, meat=found.meat + more)
-        covariance = found.covariance
+            return _redrawn(estimate, errors, bounded, factors, sigma, share**2 * meat)
+        covariance = C + share**2 * C @ more @ C if not is_standard else C
     else:
-        found = scatter(segments, estimate.theta, sigma, share * C)
-        covariance = C * (share * found.inflation)
-        if more is not None:
-            covariance += share**2 * C @ more @ C
+        theta, bread = estimate.theta, share * C
+        if is_standard:
+            theta, bread = K @ theta, share * K @ C @ K.T
+        elif not is_filter:
+            bread = solve_factor(factors, sigma, theta).covariance
+        scores = scatter(segments, theta, sigma, bread)
+        method = f"the scatter of the scores of {len(segments)} segments"
+        errors = StandardErrors(method, len(segments), scores.inflation, scores.freedom())
+        meat = scores.meat + more
+        covariance = sandwich(bread, meat)
+        if is_filter:
+            covariance = scores.inflation * bread + sandwich(bread, more)
+    if is_standard:
+        covariance = about_prior(C, K, share**2 * meat, R, share, weight_ratio)
     covariance[is_open, is_open] = np.inf
     estimate = replace(estimate, covariance=covariance)
-    method = f"the scatter of the scores of {len(segments)} segments"
-    errors = StandardErrors(method, len(segments), found.inflation, found.freedom())
-    if bounded is not None:
-        return _redrawn(estimate, errors, bounded, factors, sigma, share**2 * found.meat)
-    return estimate, errors
+    if bounded is None:
+        return estimate, errors
+    return _redrawn(estimate, errors, bounded, factors, sigma, share**2 * meat)
 
 
 def with_wls_errors(estimate: Estimate, wls: Estimate) -> Estimate:
@@ -128,8 +124,6 @@ def with_wls_errors(estimate: Estimate, wls: Estimate) -> Estimate:
 
     A gradient method ends near the minimum of least squares. Its mean square error is the
     covariance of that minimum plus the square of the distance to it.
-
-    estimate (b,).
     """
     distance = estimate.theta - wls.theta
     covariance = wls.covariance + np.outer(distance, distance)
@@ -147,10 +141,7 @@ def with_wls_errors(estimate: Estimate, wls: Estimate) -> Estimate:
 def standard_of(
     estimate: Estimate, mapping: BaseMapping, prior: Array, spread: Array
 ) -> tuple[Array, Array]:
-    """Return the standard parameters of an estimate and their covariance, prior included.
-
-    estimate (b,), prior (p,), spread (p,).
-    """
+    """Return the standard parameters of an estimate and their covariance, prior included."""
     if estimate.names == mapping.names:
         return estimate.theta, estimate.covariance
     G, K = mapping.gain(spread), mapping.K
@@ -164,10 +155,7 @@ def standard_of(
 def about_prior(
     C: Array, K: Array, meat: Array, R: Array, share: float, weight_ratio: float
 ) -> Array:
-    """Return C (K^T meat K + weight_ratio L) C with L = C^-1 - share K^T R^T R K, shape (p, p).
-
-    K (b, p), meat (b, b), R (b, b).
-    """
+    """Return C (K^T meat K + weight_ratio L) C with L = C^-1 - share K^T R^T R K, shape (p, p)."""
     KC = K @ C
     RKC = R @ KC
     covariance: Array = weight_ratio * (C - share * RKC.T @ RKC) + KC.T @ meat @ KC
@@ -180,31 +168,25 @@ def _redrawn(
     fit: Consistent,
     factors: Factors,
     sigma: Array,
-    meat: Array,
+    meat: Array,  # (b, b), covariance of the score of the rows of ``Consistent.rows``
 ) -> tuple[Estimate, StandardErrors]:
-    """Return the estimate with the mean square distance of resampled fits as its covariance.
-
-    The meat is the covariance of the score of the rows of ``Consistent.rows``.
-    """
+    """Return the estimate with the mean square distance of resampled fits as its covariance."""
     rows, rng = fit.rows(factors, sigma), np.random.default_rng(0)
-    found, failures = fit.programme.redrawn(
+    distances, failures = fit.programme.redrawn(
         rows, fit.prior_weight, estimate.theta, meat, fit.weight_ratio, _DRAWS, rng
     )
-    if len(found) < _LEAST_SOLVED * _DRAWS:
-        solved = f"only {len(found)} of {_DRAWS} fits to resampled data were solved: {failures[0]}"
+    count = len(distances)
+    if count < _LEAST_SOLVED * _DRAWS:
+        solved = f"only {count} of {_DRAWS} fits to resampled data were solved: {failures[0]}"
         method = f"{errors.method}; active bounds are neglected, {solved}"
         return estimate, replace(errors, method=method)
     unsolved = f" ({len(failures)} more not solved: {failures[0]})" if failures else ""
-    method = (
-        f"{errors.method}; bounds are active: {len(found)} fits to resampled data and "
-        f"prior{unsolved}"
-    )
-    freedom = 1.0 / (1.0 / errors.freedom + 1.0 / len(found))
-    covariance = found.T @ found / len(found)
-    return (
-        replace(estimate, covariance=covariance),
-        replace(errors, method=method, freedom=freedom, unbounded=estimate.std_error),
-    )
+    errors = StandardErrors(
+        f"{errors.method}; bounds are active: {count} fits to resampled data and prior{unsolved}",
+        errors.segments, errors.inflation, 1.0 / (1.0 / errors.freedom + 1.0 / count),
+        unbounded=estimate.std_error,
+    )  # fmt: skip
+    return replace(estimate, covariance=distances.T @ distances / count), errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,11 +205,10 @@ class TorqueBand:
     def coverage(self, tau: Array, prediction: Array, mask: Array) -> Array:
         """Return the share of each joint's torques in the 95 % band, shape (n_rows,) [-].
 
-        tau (N, n_rows) [N m, N], prediction (N, n_rows) [N m, N], mask (N, n_rows).
+        tau, prediction and mask (N, n_rows); a row that determines the band may lie on its edge.
         """
         used = mask[self.samples]
         error = np.abs(tau[self.samples] - prediction[self.samples])
-        # a row that determines the band may lie on its edge
         is_inside = (error <= (1.0 + _ROUNDING) * QUANTILE * self.total) & used
         count = used.sum(axis=0)
         return np.where(count > 0, is_inside.sum(axis=0) / np.maximum(count, 1), np.nan)
@@ -237,16 +218,14 @@ def torque_band(
     model: RobotModel,
     mapping: BaseMapping,
     trajectory: Trajectory,
-    covariance: Array,
-    noise: Array,
+    covariance: Array,  # (b, b)
+    noise: Array,  # (n_rows,) [N m, N]
     errors: Callable[[Array], Sequence[tuple[Array, Array]]] = lambda rows: (),
 ) -> TorqueBand:
     """Return the band of predicted torques, at up to 500 samples.
 
     Its variance is diag(W C W^T) + sum (W x + z)^2. Each pair (x, z) is an error that changes the
     base parameters by x and, together with them, the torque by z.
-
-    covariance (b, b), noise (n_rows,) [N m, N], errors (b,).
     """
     count = len(trajectory.t)
     samples = np.unique(np.linspace(0, count - 1, min(count, _MOST)).round().astype(int))

@@ -9,6 +9,7 @@ the torque by the position. One group is estimated with the others at theta.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -57,7 +58,7 @@ class RunsOf:
 
 @dataclass(frozen=True, eq=False)
 class RunSums:
-    """Sums over the rows of k runs; those of new runs are added without the rows of the others.
+    """Sums over the rows of k runs, to which those of new runs are added.
 
     The rows are A = W B of the Q parameters of all groups, in their order, and the residuals
     r = tau - W theta, over the noise level of their joint. Zeros are last: see ``with_zeros``.
@@ -65,9 +66,7 @@ class RunSums:
 
     H: Array  # (k, Q, Q), A^T A of each run; the blocks of the groups are used
     h: Array  # (k, Q), A^T r of each run, each group over its own joints
-    #: (g, 2), of each group, the scatter of the scores of segments about each run's estimate, and
-    #: that of independent rows; see ``inflation_of``.
-    scatter: Array
+    scatter: Array  # (g, 2), of each group: of scores about each run's estimate, and expected
     sigma: Array  # (n,), noise level per joint [N m or N]
 
     def joined(self, new: "RunSums") -> "RunSums":
@@ -102,16 +101,11 @@ def sums_of(
     standard: Array,
     sigma: Array,
 ) -> RunSums:
-    """Return the sums of runs over all groups of parameters.
-
-    standard (p,), sigma (n,) [N m or N].
-    """
+    """Return the sums of runs over all groups of parameters: standard (p,), sigma (n,)."""
     theta, groups = mapping.to_base(standard), [g for g, _ in groups_at(model, mapping, standard)]
     products = [_products(run, groups, theta, sigma) for run in segments]
-    scatter = [
-        _scatter([(H[:, own, own], g[:, own]) for H, g in products]) for own in _places(groups)
-    ]
-    H, h = (np.array([each[k].sum(axis=0) for each in products]) for k in (0, 1))
+    scatter = [_scatter([(H[:, x, x], g[:, x]) for H, g in products]) for x in _places(groups)]
+    H, h = (np.array([x.sum(axis=0) for x in parts]) for parts in zip(*products, strict=True))
     return RunSums(H, h, np.array(scatter), sigma)
 
 
@@ -125,32 +119,28 @@ def with_zeros(sums: RunSums, parts: Sequence[Array]) -> RunSums:
 
 
 def runs_of(
-    model: RobotModel,
-    mapping: BaseMapping,
-    standard: Array,
-    sums: RunSums,
-    unit: Array,
+    model: RobotModel, mapping: BaseMapping, standard: Array, sums: RunSums, unit: Array
 ) -> tuple[RunsOf, ...]:
     """Return the information of each run on each group of parameters: unit (k,)."""
     every = groups_at(model, mapping, standard)
     places = _places([group for group, _ in every])
-    kept = [k for k, own in enumerate(places) if sums.H[:, own, own].any()]  # some run has effects
     squares = np.einsum("kqq->q", sums.H)
-    of_gains = {group.name: squares[own].item()
-                for (group, _), own in zip(every, places, strict=True)
+    of_gains = {group.name: squares[place].item()
+                for (group, _), place in zip(every, places, strict=True)
                 if group.kind == "gain"}  # fmt: skip
-    found = []
-    for k in kept:
-        (group, centre), own = every[k], places[k]
-        H, inflation = sums.H[:, own, own], _ratio(*sums.scatter[k])
+    runs = []
+    for (group, centre), place, scatter in zip(every, places, sums.scatter, strict=True):
+        H, h, inflation = sums.H[:, place, place], sums.h[:, place], _ratio(*scatter)
+        if not H.any():  # no run has effects
+            continue
         if group.kind == "zero":
-            like_gain = np.sqrt(of_gains[group.name] / squares[own])
+            like_gain = np.sqrt(of_gains[group.name] / squares[place])
             scale = np.maximum(_ZERO[group.units[0]], _LEVER * like_gain)
         else:
             scale = _scale(group, centre, H.sum(axis=0), model, standard)
-        runs = Runs(H / inflation, sums.h[:, own] / inflation, unit, scale)
-        found.append(RunsOf(group, centre, runs, inflation))
-    return tuple(found)
+        information = Runs(H / inflation, h / inflation, unit, scale)
+        runs.append(RunsOf(group, centre, information, inflation))
+    return tuple(runs)
 
 
 def _places(groups: Sequence[Group]) -> list[slice]:
@@ -163,36 +153,33 @@ def groups_at(
     model: RobotModel, mapping: BaseMapping, standard: Array
 ) -> list[tuple[Group, Array]]:
     """Return the groups and their values in the fit: standard (p,)."""
-    layout, base = model.layout, mapping.base_names
-    rows = tuple(range(model.n_rows))
-    eye, found = np.eye(len(base)), []
-    units = dict(zip(layout.names, layout.units, strict=True))
-    places = {name: k for k, name in enumerate(layout.names)}
+    layout, base, theta = model.layout, mapping.base_names, mapping.to_base(standard)
+    rows, eye, groups = tuple(range(model.n_rows)), np.eye(len(base)), []
+    unit_of = dict(zip(layout.names, layout.units, strict=True))
+    place_of = {name: k for k, name in enumerate(layout.names)}
     for drive in layout.drives:
-        own = [k for k, name in enumerate(base) if name.rpartition(".")[0] == drive.name
-               and name in layout.drive_names]  # fmt: skip
-        if own:
-            names = tuple(base[k] for k in own)
-            own_units = tuple(units[name] for name in names)
-            group = Group("drive", drive.name, names, own_units, eye[:, own], rows)
-            found.append((group, standard[[places[n] for n in names]]))
-    theta = mapping.to_base(standard)
+        is_own = [x.rpartition(".")[0] == drive.name and x in layout.drive_names for x in base]
+        if any(is_own):
+            terms = tuple(compress(base, is_own))
+            units = tuple(unit_of[name] for name in terms)
+            group = Group("drive", drive.name, terms, units, eye[:, is_own], rows)
+            groups.append((group, standard[[place_of[name] for name in terms]]))
     if not model.constraints:  # rows of one joint each
         first = model.n_rows - len(layout.joints)
         for j, joint in enumerate(layout.joints, start=first):
             gain = Group("gain", joint, (f"{joint}.gain",), ("-",), theta[:, None], (j,))
-            found.append((gain, np.ones(1)))
+            groups.append((gain, np.ones(1)))
     link = layout.bodies[-1]
     names = tuple(f"{link}.{term}" for term in _PAYLOAD)
-    columns = mapping.K[:, [places[name] for name in names]]
-    payload = Group("payload", link, names, tuple(units[n] for n in names), columns, rows)
-    found.append((payload, np.zeros(len(names))))
+    columns = mapping.K[:, [place_of[name] for name in names]]
+    payload = Group("payload", link, names, tuple(unit_of[n] for n in names), columns, rows)
+    groups.append((payload, np.zeros(len(names))))
     if not (model.constraints or model.free_flyer):
         for joint in layout.joints:
-            unit, none = "m" if joint in layout.prismatic else "rad", np.zeros((len(base), 1))
-            zero = Group("zero", joint, (f"{joint}.zero",), (unit,), none, rows)
-            found.append((zero, np.zeros(1)))
-    return found
+            unit = "m" if joint in layout.prismatic else "rad"
+            zero = Group("zero", joint, (f"{joint}.zero",), (unit,), 0.0 * theta[:, None], rows)
+            groups.append((zero, np.zeros(1)))
+    return groups
 
 
 def _products(
@@ -200,34 +187,31 @@ def _products(
 ) -> tuple[Array, Array]:
     """Return A^T A (s, Q, Q) and A^T r (s, Q) of each segment with A = W B, r = tau - W theta.
 
-    A of a group is 0 in rows of joints that it does not act on. Rows are divided by the noise level
-    of their joint.
+    A of a group is 0 in rows of joints that it does not act on. Rows are over their noise level.
     """
-    B, acts = columns_of(groups, len(sigma))
+    B, sizes = np.hstack([x.columns for x in groups]), [x.columns.shape[1] for x in groups]
+    acts = [np.repeat([j in group.rows for group in groups], sizes) for j in range(len(sigma))]
     H, g = np.zeros((len(segments), B.shape[1], B.shape[1])), np.zeros((len(segments), B.shape[1]))
     for k, segment in enumerate(segments):
         for j, level in enumerate(sigma):
-            R, own = segment.triangles[j] / level, segment.columns[j]
-            A = R[:, :-1] @ (B[own] * acts[j])
+            R, columns = segment.triangles[j] / level, segment.columns[j]
+            A = R[:, :-1] @ (B[columns] * acts[j])
             H[k] += A.T @ A
-            g[k] += A.T @ (R[:, -1] - R[:, :-1] @ theta[own])
+            g[k] += A.T @ (R[:, -1] - R[:, :-1] @ theta[columns])
     return H, g
-
-
-def columns_of(groups: Sequence[Group], n_rows: int) -> tuple[Array, Array]:
-    """B of all groups, shape (b, Q), and in which of a sample's rows each acts, (n_rows, Q)."""
-    sizes = [group.columns.shape[1] for group in groups]
-    acts = np.array([[j in group.rows for group in groups] for j in range(n_rows)])
-    return np.hstack([group.columns for group in groups]), np.repeat(acts, sizes, axis=1)
 
 
 def inflation_of(runs: Sequence[tuple[Array, Array]]) -> float:
     """Return the variance of the scores of segments about each run's estimate.
 
     It is relative to that of independent rows of the stated noise level, and common to all runs: a
-    run alone has too few segments.
+    run alone has too few segments. With one segment per run it is 1.
     """
     return _ratio(*_scatter(runs))
+
+
+def _ratio(scatter: float, expected: float) -> float:
+    return max(scatter / expected, _LEAST) if expected > _LEAST else 1.0
 
 
 def _scatter(runs: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
@@ -242,11 +226,6 @@ def _scatter(runs: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
     return scatter, expected
 
 
-def _ratio(scatter: float, expected: float) -> float:
-    """Return the inflation of two sums of ``_scatter``; 1 if there is one segment per run."""
-    return max(scatter / expected, _LEAST) if expected > _LEAST else 1.0
-
-
 def _scale(group: Group, centre: Array, H: Array, model: RobotModel, standard: Array) -> Array:
     """Return the plausible standard deviation of each parameter of a group, shape (q,).
 
@@ -259,6 +238,4 @@ def _scale(group: Group, centre: Array, H: Array, model: RobotModel, standard: A
         return mass * np.array([1.0, _REACH, _REACH, _REACH])
     norms = np.sqrt(np.maximum(np.diag(H), _LEAST))
     torque = np.sqrt(max(float(centre @ H @ centre), 0.0))
-    least = _SMALLEST * np.abs(norms).max()
-    scale: Array = _DRIVE * np.maximum(torque, least) / norms
-    return scale
+    return np.asarray(_DRIVE * np.maximum(torque, _SMALLEST * norms.max()) / norms)

@@ -1,4 +1,4 @@
-"""Spread of each parameter between runs, or between units (robots), integrated on a grid.
+"""Spread of parameters between runs, or units (robots), on a grid, and draws of a next one.
 
     x_run = mu + u_unit + u_run + e_run,    u_unit ~ N(0, s_unit^2),  u_run ~ N(0, s_run^2)
 
@@ -14,7 +14,7 @@ References:
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -29,6 +29,7 @@ _GRID = np.linspace(-6.0, 5.0, 45)  # log of standard deviations over their plau
 _SWEEPS = 2  # over the parameters of a group, each with the spread of the others
 _TAILS = np.array([0.025, 0.5, 0.975])
 _HALVINGS = 60  # of the range of a quantile
+_STEPS = 60  # of each chain; with a possible proposal, one step is an independent draw
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +57,12 @@ class Mixture:
     weight: Array  # (..., g), weights, which sum to 1
     mean: Array  # (..., g), means
     std: Array  # (..., g), standard deviations
+
+    @classmethod
+    def over_grid(cls, weight: Array, mean: Array, std: Array) -> "Mixture":
+        """Return the mixtures over the last two axes."""
+        parts = np.broadcast_arrays(weight, mean, std)
+        return cls(*(part.reshape(*part.shape[:-2], -1) for part in parts))
 
     def at(self, index: int | tuple[int, ...]) -> "Mixture":
         """Return some of the mixtures."""
@@ -145,6 +152,23 @@ class _Grid:
     others: float  # variance of the mean due to the means of the other parameters
     log_prior: Array  # (w, g)
 
+    @classmethod
+    def of(cls, W: Array, w: Array, unit: Array, scale: float, others: float) -> "_Grid":
+        """Return the grid of a parameter from the information and scores of runs (k,)."""
+        several = bool(unit.max() > 0)
+        z = _GRID - 0.5 * (_FREEDOM + 1.0) * np.log1p(np.exp(2.0 * _GRID) / _FREEDOM)
+        variance, every = (scale * np.exp(_GRID)) ** 2, slice(None, None, 2)
+        return cls(
+            between=variance[None],
+            within=variance[every, None] if several else np.zeros((1, 1)),
+            members=unit if several else np.arange(len(unit)),
+            W=W,
+            w=w,
+            prior=(_UNKNOWN * scale) ** -2.0,
+            others=max(others, 0.0),
+            log_prior=z + (z[every, None] if several else 0.0),
+        )
+
     @cached_property
     def of_runs(self) -> Array:
         """Information, score and log likelihood of each run, shape (3, k, w, 1)."""
@@ -165,9 +189,9 @@ class _Grid:
 
     def lifted(self, sums: Array) -> Array:
         """Return the sums of members with the deviation of each integrated, (3, ..., w, g)."""
-        found = _integrated(sums[0], sums[1], self.between)
-        found[2] += sums[2]
-        return found
+        integrated = _integrated(sums[0], sums[1], self.between)
+        integrated[2] += sums[2]
+        return integrated
 
     def mean(self, total: Array) -> tuple[Array, Array, Array]:
         """Return weight, mean and variance of the mean from sums (3, ..., w, g) over members."""
@@ -194,37 +218,35 @@ class _Grid:
         """Return mean, spread, and prediction of a new run of a new member."""
         weight, mean, variance = self.all
         spread = self.between + self.within
-        centre, error = _flat(weight, mean, np.sqrt(variance)).moments
+        centre, error = Mixture.over_grid(weight, mean, np.sqrt(variance)).moments
         low, median, high = self.median(1, _TAILS).tolist()
+        # with one more member of average information, at the median spread
         n = len(self.of_members[0])
         more = variance * n / (n + 1.0)
         total = 1.0 / (self.of_members[0].sum(axis=0) / n + self.prior) + variance
         at = int(np.argmin(np.abs(np.sqrt(self.between) - median)))
         log = np.log(np.maximum(weight, 1e-300))
         after = _normed(log - 0.5 * (np.log(total) + total[:, at : at + 1] / total))
-        width = _flat(after, mean, np.sqrt(more + spread)).ends
+        error_after = Mixture.over_grid(after, mean, np.sqrt(more)).moments[1]
+        ends_after = Mixture.over_grid(after, mean, np.sqrt(more + spread)).ends
         return Prediction(
-            float(centre),
-            float(error),
-            median,
-            np.array([low, high]),
-            _flat(weight, mean, np.sqrt(variance + spread)),
-            (float(_flat(after, mean, np.sqrt(more)).moments[1]), float(np.ptp(width))),
-            float(self.median(0)[0]) if len(self.within) > 1 else None,
+            mean=float(centre),
+            std_error=float(error),
+            spread=median,
+            spread_ends=np.array([low, high]),
+            mixture=Mixture.over_grid(weight, mean, np.sqrt(variance + spread)),
+            after=(float(error_after), float(np.ptp(ends_after))),
+            within=float(self.median(0)[0]) if len(self.within) > 1 else None,
         )
 
     def values(self) -> tuple[Array, Array]:
         """Return the parameter in each run and its standard error, shape (k,)."""
         weight, mean, variance = self.all
-        steps = (self.sums[:2], self.between), (np.array([self.W, self.w])[..., None, None],
-                                                self.within)  # fmt: skip
-        for number, ((W, w), d) in enumerate(steps):
-            if number:
-                mean, variance = mean[self.members], variance[self.members]
-            left = 1.0 / (1.0 + d * W)
-            mean = mean + d * left * (w - W * mean)
-            variance = d * left + left**2 * variance
-        return _flat(np.broadcast_to(weight, mean.shape), mean, np.sqrt(variance)).moments
+        mean, variance = _shrunk(self.sums[0], self.sums[1], self.between, mean, variance)
+        mean, variance = mean[self.members], variance[self.members]
+        W, w = self.W[:, None, None], self.w[:, None, None]
+        mean, variance = _shrunk(W, w, self.within, mean, variance)
+        return Mixture.over_grid(weight, mean, np.sqrt(variance)).moments
 
     def without(self, which: Array, *, is_member: bool, error: Array) -> Mixture:
         """Return the predictions of estimates by all runs except theirs: which, error (m,)."""
@@ -238,7 +260,8 @@ class _Grid:
             spread = self.between + self.within
         left[0] = np.maximum(left[0], 0.0)
         weight, mean, variance = self.mean(left)
-        return _flat(weight, mean, np.sqrt(variance + spread + error[:, None, None] ** 2))
+        std = np.sqrt(variance + spread + error[:, None, None] ** 2)
+        return Mixture.over_grid(weight, mean, std)
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,31 +282,21 @@ class SpreadModel:
             more = np.diag(covariance) - 1.0 / np.diag(information)
             h = runs.h - runs.H @ centre
             grids = [
-                _grid_of(*_alone(runs.H, h, spread, p), runs.unit, float(scale), float(more[p]))
+                _Grid.of(*_alone(runs.H, h, spread, p), runs.unit, float(scale), float(more[p]))
                 for p, scale in enumerate(runs.scale)
             ]
             spread = np.array([np.hypot(grid.median(0), grid.median(1))[0] for grid in grids])
         return centre, grids
 
-    @property
-    def centre(self) -> Array:
-        """Mean of the parameters, shape (q,)."""
-        return self.centred[0]
-
-    @property
-    def grids(self) -> list[_Grid]:
-        """Each parameter about its mean."""
-        return self.centred[1]
-
     @cached_property
     def deviation(self) -> Array:
         """Medians of the standard deviations of runs and units about the mean, shape (2, q)."""
-        return np.array([[grid.median(level)[0] for grid in self.grids] for level in (0, 1)])
+        return np.array([[x.median(level)[0] for x in self.centred[1]] for level in (0, 1)])
 
     def predict(self) -> Iterator[Prediction]:
         """Yield the prediction of each parameter in a new run of a new unit."""
-        for centre, grid in zip(self.centre.tolist(), self.grids, strict=True):
-            yield grid.prediction().shifted(centre)
+        for centre, grid in zip(*self.centred, strict=True):
+            yield grid.prediction().shifted(float(centre))
 
     @cached_property
     def values(self) -> tuple[Array, Array]:
@@ -291,12 +304,13 @@ class SpreadModel:
 
         They are means of the run's own estimate and of the others, weighted by information.
         """
-        values, errors = zip(*(grid.values() for grid in self.grids), strict=True)
-        return self.centre + np.transpose(values), np.transpose(errors)
+        centre, grids = self.centred
+        values, errors = zip(*(grid.values() for grid in grids), strict=True)
+        return centre + np.transpose(values), np.transpose(errors)
 
     def against_others(self, which: Array, *, is_unit: bool) -> Compared:
         """Compare runs, or units, each with the prediction of all others: which (m,)."""
-        H, h = self.runs.H, self.runs.h
+        (centre, grids), H, h = self.centred, self.runs.H, self.runs.h
         if is_unit:
             H, h = lifted(H, h, np.diag(self.deviation[0] ** 2))
             H, h = (np.array([x[self.runs.unit == u].sum(axis=0) for u in which]) for x in (H, h))
@@ -304,23 +318,18 @@ class SpreadModel:
             H, h = H[which], h[which]
         covariance = covariance_of(H, self.runs.scale)
         errors = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-        parts = [
+        others = [
             grid.without(which, is_member=is_unit, error=error)
-            for grid, error in zip(self.grids, errors.T, strict=True)
+            for grid, error in zip(grids, errors.T, strict=True)
         ]
-        weight, mean, std = (
-            np.stack([getattr(part, name) for part in parts], axis=1)
-            for name in ("weight", "mean", "std")
-        )
-        mixture = Mixture(weight, mean + self.centre[:, None], std)
+        parts = ([x.weight, x.mean, x.std] for x in others)
+        weight, mean, std = (np.stack(part, axis=1) for part in zip(*parts, strict=True))
+        mixture = Mixture(weight, mean + centre[:, None], std)
         return Compared(np.einsum("mpi,mi->mp", covariance, h), covariance, mixture)
 
 
 def covariance_of(H: Array, scale: Array) -> Array:
-    """Return the covariance of parameters from their information, with almost no prior.
-
-    H (..., q, q), scale (q,).
-    """
+    """Return the covariance of parameters (q,) from information (..., q, q), almost no prior."""
     return np.asarray(np.linalg.inv(H + _prior_of(scale)))
 
 
@@ -343,27 +352,16 @@ def _alone(H: Array, h: Array, spread: Array, p: int) -> tuple[Array, Array]:
     return np.maximum(W, 0.0), h[:, p] - np.einsum("ko,ko->k", G, h[:, others])
 
 
-def _grid_of(W: Array, w: Array, unit: Array, scale: float, others: float) -> _Grid:
-    """Return the grid of a parameter from the information and scores of runs (k,)."""
-    several = bool(unit.max() > 0)
-    z = _GRID - 0.5 * (_FREEDOM + 1.0) * np.log1p(np.exp(2.0 * _GRID) / _FREEDOM)
-    variance, every = (scale * np.exp(_GRID)) ** 2, slice(None, None, 2)
-    return _Grid(
-        between=variance[None],
-        within=variance[every, None] if several else np.zeros((1, 1)),
-        members=unit if several else np.arange(len(unit)),
-        W=W,
-        w=w,
-        prior=(_UNKNOWN * scale) ** -2.0,
-        others=max(others, 0.0),
-        log_prior=z + (z[every, None] if several else 0.0),
-    )
-
-
 def _integrated(W: Array, w: Array, d: Array) -> Array:
     """Return information, score and log likelihood without a deviation of variance d."""
     t = 1.0 + d * W
     return np.array([W / t, w / t, 0.5 * (d * w**2 / t - np.log(t))])
+
+
+def _shrunk(W: Array, w: Array, d: Array, mean: Array, variance: Array) -> tuple[Array, Array]:
+    """Return mean and variance of values about a mean with deviations of variance d."""
+    left = 1.0 / (1.0 + d * W)
+    return mean + d * left * (w - W * mean), d * left + left**2 * variance
 
 
 def _normed(log: Array) -> Array:
@@ -372,10 +370,64 @@ def _normed(log: Array) -> Array:
     return np.asarray(weight / weight.sum(axis=(-2, -1), keepdims=True))
 
 
-def _flat(weight: Array, mean: Array, std: Array) -> Mixture:
-    """Return the mixture over the last two axes."""
-    shape = np.broadcast_shapes(weight.shape, mean.shape, std.shape)
-    weight, mean, std = (
-        np.broadcast_to(x, shape).reshape(*shape[:-2], -1) for x in (weight, mean, std)
-    )
-    return Mixture(weight, mean, std)
+def root_of(covariance: Array) -> Array:
+    """Return L with L L^T = C, lower triangular, shape (p, p): covariance (p, p)."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    inverse = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
+    w, V = np.linalg.eigh(inverse[:, None] * covariance * inverse)
+    least = len(w) * np.finfo(float).eps * float(w.max(initial=0.0))  # rounding error
+    w = np.where(w > max(least, 0.0), w, 0.0)
+    R = np.linalg.qr((scale[:, None] * V * np.sqrt(w)).T, mode="r")
+    sign = np.where(np.diag(R) < 0.0, -1.0, 1.0)
+    return np.asarray(np.tril((sign[:, None] * R).T))
+
+
+def possible_draws(
+    root: Array, is_possible: Callable[[Array], Array], count: int, rng: np.random.Generator
+) -> Array:
+    """Return draws of x ~ N(0, L L^T), L (p, r), given that they are possible, shape (count, p).
+
+    Each draw is the end of its own chain of elliptical slice sampling from x = 0, which must be
+    possible (Murray, Adams, MacKay, 2010, Elliptical slice sampling, figure 2).
+    """
+    x = np.zeros((count, len(root)))
+    for _ in range(_STEPS):
+        other = rng.standard_normal((count, root.shape[1])) @ root.T
+        angle = rng.uniform(0.0, 2.0 * np.pi, count)
+        low, high, left = angle - 2.0 * np.pi, angle.copy(), np.arange(count)
+        moved = x.copy()
+        while len(left):
+            a = angle[left, None]
+            tried = x[left] * np.cos(a) + other[left] * np.sin(a)
+            accepted = is_possible(tried)
+            moved[left[accepted]] = tried[accepted]
+            left = left[~accepted]
+            low[left] = np.where(angle[left] < 0.0, angle[left], low[left])
+            high[left] = np.where(angle[left] < 0.0, high[left], angle[left])
+            angle[left] = rng.uniform(low[left], high[left])
+        x = moved
+    return x
+
+
+def correlated_scores(scores: Array, share: Array, correlation: Array, drawn: Array) -> Array:
+    """Return standard normal scores of a new run: error of the fit, and deviation of the run.
+
+    z = sqrt(share) * scores + sqrt(1 - share) * w with w ~ N(0, R): scores, drawn (k, m).
+    """
+    w = drawn @ np.linalg.cholesky(correlation).T
+    return np.asarray(np.sqrt(share) * scores + np.sqrt(1.0 - share) * w)
+
+
+def scores_to_values(z: Array, scores: Array, quantiles: Array, least: float) -> Array:
+    """Return the values at standard normal scores z (k,) of a predictive distribution.
+
+    Its quantiles (s,) are given at some scores (s,); no value is below the least one.
+    """
+    slope = np.diff(quantiles) / np.diff(scores)
+    if least > quantiles[0]:
+        below = scipy.special.ndtr(np.interp(least, quantiles, scores))
+        z = scipy.special.ndtri(below + (1.0 - below) * scipy.special.ndtr(z))
+    values = np.interp(z, scores, quantiles)
+    values = values + slope[0] * np.minimum(z - scores[0], 0.0)
+    values = values + slope[-1] * np.maximum(z - scores[-1], 0.0)
+    return np.asarray(np.maximum(values, least))

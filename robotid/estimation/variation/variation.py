@@ -23,7 +23,6 @@ from robotid.estimation.variation.spread import (
 SCORES = np.linspace(-3.5, 3.5, 15)
 #: Probability that one of alike runs or units is named.
 FALSE_ALARMS = 0.02
-_PENALTY = 2.0  # evidence that each parameter of a group must add (Akaike)
 _LEAST_SHRUNK = 1e-3  # smallest share of the shrinkage: the correlation has an inverse
 _SCALE = 0.1  # smallest plausible standard deviation between units, over the parameter's size
 _SPREADS = 32  # standard deviations between units over which a test is integrated
@@ -36,11 +35,8 @@ class VaryingParameter:
 
     name: str  # its name, for example "elbow.coulomb"
     unit: str  # its unit
-    #: Mean, spread between runs, and prediction interval of the next run; between units and of the
-    #: next unit, if there are several.
-    prediction: Prediction
-    #: (k,), its value in each run: the run's own and the mean, weighted by their information.
-    values: Array
+    prediction: Prediction  # of the next run, or of the next unit if there are several
+    values: Array  # (k,), in each run: the run's own and the mean, weighted by their information
     std_errors: Array  # (k,), their standard errors
 
     def to_dict(self) -> dict[str, Any]:
@@ -96,11 +92,7 @@ class Variation:
 
     @cached_property
     def correlation(self) -> Array:
-        """Correlation of the parameters between runs, or between units if there are several.
-
-        It is that of the values in the runs or units, shrunk to 0 by its own uncertainty; shape
-        (m, m).
-        """
+        """Correlation of the parameters between runs, or units if there are several, (m, m)."""
         values = np.array([x.values for x in self.parameters]).reshape(-1, len(self.runs))
         if self.units > 1:
             unit = np.array(self.of_runs)
@@ -109,18 +101,16 @@ class Variation:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, as result.json has them."""
-        return {
+        content: dict[str, Any] = {
             "logs": list(self.runs),
             "units": self.units,
             "parameters": {x.name: x.to_dict() for x in self.parameters},
             "correlation": self.correlation.tolist(),
             "unlike": [run.to_dict(self.runs) for run in self.unlike],
-            **(
-                {"unlike_units": [unit.to_dict(self.unit_names) for unit in self.unlike_units]}
-                if self.units > 1
-                else {}
-            ),
         }
+        if self.units > 1:
+            content["unlike_units"] = [x.to_dict(self.unit_names) for x in self.unlike_units]
+        return content
 
 
 def vary(
@@ -133,27 +123,21 @@ def vary(
     """
     if len(names) < FEWEST_RUNS or not groups:
         return None
-    models = [SpreadModel(group.runs) for group in groups]
-    pairs = list(zip(groups, models, strict=True))
+    pairs = [(group, SpreadModel(group.runs)) for group in groups]
     unit = groups[0].runs.unit
-    n_units = int(unit.max()) + 1
-    compared_units = np.arange(n_units if n_units > FEWEST_RUNS else 0)
-    compared_runs = np.arange(len(names) if len(names) > FEWEST_RUNS else 0)
+    n_units, n_runs = int(unit.max()) + 1, len(names)
+    units_tested = np.arange(n_units if n_units > FEWEST_RUNS else 0)
+    runs_tested = np.arange(n_runs if n_runs > FEWEST_RUNS else 0)
     size = sum(len(group.runs.scale) for group in groups)
-    n_tests = size * (len(compared_units) + len(compared_runs))
-    unlike_units = _unlike(pairs, compared_units, n_tests, is_unit=True)
-    different = [odd.run for odd in unlike_units]
-    alike = compared_runs[~np.isin(unit[: len(compared_runs)], different)]
+    n_tests = size * (len(units_tested) + len(runs_tested))
+    unlike_units = _unlike(pairs, units_tested, n_tests, is_unit=True)
+    is_alike = ~np.isin(unit[runs_tested], [odd.run for odd in unlike_units])
+    drives = [pair for pair in pairs if pair[0].group.kind == "drive"]
     return Variation(
         runs=tuple(names),
         units=n_units,
-        parameters=tuple(
-            parameter
-            for group, model in pairs
-            if group.group.kind == "drive"
-            for parameter in _parameters(group, model)
-        ),
-        unlike=tuple(_unlike(pairs, alike, n_tests, is_unit=False)),
+        parameters=tuple(x for group, model in drives for x in _parameters(group, model)),
+        unlike=tuple(_unlike(pairs, runs_tested[is_alike], n_tests, is_unit=False)),
         unit_names=tuple(units) or tuple(map(str, range(n_units))),
         unlike_units=tuple(unlike_units),
         of_runs=tuple(unit.tolist()),
@@ -161,51 +145,46 @@ def vary(
 
 
 def between_covariance(variation: Mapping[str, Any], names: Sequence[str]) -> Array:
-    """Return the covariance of parameters in the next run that the fit to all runs lacks.
+    """Return the covariance (p, p) of parameters in the next run that the fit to all runs lacks.
 
-    Standard deviations are the medians of the spreads: between runs, or between units and between
-    the runs of a unit.
+    Standard deviations are the medians of the spreads, those within units included.
     """
-    at = {name: k for k, name in enumerate(names)}
-    known = [(k, *x) for k, x in enumerate(variation["parameters"].items()) if x[0] in at]
-    varying, places = [k for k, *_ in known], [at[name] for _, name, _ in known]
-    std = np.array([np.hypot(x["spread"], x.get("spread_within_units", 0.0)) for *_, x in known])
     covariance = np.zeros((len(names), len(names)))
+    known = [(k, name) for k, name in enumerate(variation["parameters"]) if name in names]
+    varying, places = [k for k, _ in known], [list(names).index(name) for _, name in known]
+    spreads = [variation["parameters"][name] for _, name in known]
+    std = np.array([np.hypot(x["spread"], x.get("spread_within_units", 0.0)) for x in spreads])
     R = np.array(variation["correlation"])[np.ix_(varying, varying)]
     covariance[np.ix_(places, places)] = std[:, None] * R * std
     return covariance
 
 
 def shrunk_correlation(values: Array) -> Array:
-    """Return the correlation of parameters, shrunk to 0 by its own uncertainty.
+    """Return the correlation of parameters (k, m), shrunk to 0 by its own uncertainty.
 
     r*_ij = a_i a_j r_ij with a_i^2 = 1 - sum Var(r_ij) / sum r_ij^2 over j != i, within [0, 1]: a
     parameter that hardly varies, and correlates by noise alone, leaves the others as they are. The
     matrix is positive definite, as a product of positive semidefinite matrices by elements (Schur).
-    Var(r) is that of normal values, (1 - r^2)^2 / (k - 1), times (k^2 - 1) / (k^2 - 2 k): its mean
-    is then 1 / (k - 1), as it is, for independent parameters. Two runs determine no correlation.
+    Var(r) is that of normal values, (1 - r^2)^2 / (k - 1) (Hotelling, 1953), times
+    (k^2 - 1) / (k^2 - 2 k): its mean then is right for independent parameters. Two runs determine
+    no correlation.
 
     References:
         Schaefer, Strimmer (2005), A shrinkage approach to large-scale covariance matrix
-        estimation, doi:10.2202/1544-6115.1175, section 2.4 (target D), there with one factor for
-        all parameters. Hotelling (1953), New light on the correlation coefficient and its
-        transforms (variance of r).
-
-    values (k, m).
+        estimation, doi:10.2202/1544-6115.1175, section 2.4 (target D), there with one factor.
     """
     k, m = values.shape
     if k < FEWEST_RUNS:
         return np.eye(m)
-    centred = values - values.mean(axis=0)
-    std = np.sqrt((centred**2).sum(axis=0) / (k - 1))
-    z = centred / np.where(std > 0.0, std, 1.0)
+    std = values.std(axis=0, ddof=1)
+    varies = std > 0.0
+    z = (values - values.mean(axis=0)) / np.where(varies, std, 1.0)
     r = z.T @ z / (k - 1)
     off = ~np.eye(m, dtype=bool)
-    others = off & (std > 0.0)
-    size = (r**2 * others).sum(axis=1)
-    variance = (1.0 - r**2) ** 2 * (k + 1) / (k * (k - 2))
-    share = (variance * others).sum(axis=1) / np.where(size > 0.0, size, 1.0)
-    left = np.sqrt(1.0 - np.clip(np.where(size > 0.0, share, 1.0), _LEAST_SHRUNK, 1.0))
+    size = np.sum(r**2, axis=1, where=off & varies)
+    variance = np.sum((1.0 - r**2) ** 2, axis=1, where=off & varies) * (k + 1) / (k * (k - 2))
+    share = np.divide(variance, size, out=np.ones(m), where=size > 0.0)
+    left = np.sqrt(1.0 - np.clip(share, _LEAST_SHRUNK, 1.0))
     return np.where(off, left[:, None] * r * left, 1.0)
 
 
@@ -216,9 +195,7 @@ def between_units(
 
     The unit farthest from the others is tested against them; if it differs, it is left out, and the
     next one is tested. Prediction and spread are of the units that are alike. Units that differ
-    come with the two-sided probability of such a difference.
-
-    values (u,), std_errors (u,).
+    come with the two-sided probability of such a difference. values, std_errors (u,).
     """
     left, unlike = np.arange(len(values)), list[tuple[int, float]]()
     while len(left) > FEWEST_RUNS:
@@ -262,17 +239,12 @@ def _probability_of_last(values: Array, std_errors: Array) -> float:
 
 def _parameters(group: RunsOf, model: SpreadModel) -> Iterator[VaryingParameter]:
     """Yield the parameters of a group on which the runs have information."""
-    known, (values, errors) = np.einsum("kpp->p", group.runs.H) > 0.0, model.values
+    is_known, (values, errors) = np.einsum("kpp->p", group.runs.H) > 0.0, model.values
+    names, units, centres = group.group.parameters, group.group.units, group.centre.tolist()
     for p, prediction in enumerate(model.predict()):
-        if known[p]:
-            centre = float(group.centre[p])
-            yield VaryingParameter(
-                group.group.parameters[p],
-                group.group.units[p],
-                prediction.shifted(centre),
-                centre + values[:, p],
-                errors[:, p],
-            )
+        if is_known[p]:
+            moved, x = prediction.shifted(centres[p]), centres[p] + values[:, p]
+            yield VaryingParameter(names[p], units[p], moved, x, errors[:, p])
 
 
 def _unlike(
@@ -281,39 +253,40 @@ def _unlike(
     """Return the runs or units that differ from the others, in order."""
     if not len(which):
         return []
+    groups = [group for group, _ in pairs]
     compared = [model.against_others(which, is_unit=is_unit) for _, model in pairs]
-    probability = np.array([
+    p_values = [  # (m, q) of each group
         np.where(_is_compared(group, which, is_unit=is_unit)[:, None],
-                 c.mixture.beyond(c.values), np.inf).min(axis=1)
-        for (group, _), c in zip(pairs, compared, strict=True)
-    ])  # fmt: skip
-    noise = float(np.median([group.inflation for group, _ in pairs]))  # of a typical group
+                 c.mixture.beyond(c.values), np.inf)
+        for group, c in zip(groups, compared, strict=True)
+    ]  # fmt: skip
+    probability = np.array([p.min(axis=1) for p in p_values])  # (groups, m)
+    noise = float(np.median([group.inflation for group in groups]))  # of a typical group
     unlike = []
     for k in np.flatnonzero(probability.min(axis=0) * n_tests < FALSE_ALARMS).tolist():
         evidence = [
             _explained(c, k, noise / group.inflation, is_drive=group.group.kind == "drive")
             if p[k] * n_tests < FALSE_ALARMS
             else -np.inf
-            for (group, _), c, p in zip(pairs, compared, probability, strict=True)
+            for group, c, p in zip(groups, compared, probability, strict=True)
         ]
         best = int(np.argmax(evidence))
-        (group, _), c = pairs[best], compared[best]
-        p = int(np.argmin(c.mixture.beyond(c.values)[k]))
+        group, c = groups[best].group, compared[best]
+        p = int(np.argmin(p_values[best][k]))
         prediction = c.mixture.at((k, p))
-        centre = float(group.centre[p])
-        if group.group.kind in ("payload", "zero"):  # relative to the other runs
+        centre = float(groups[best].centre[p])
+        if group.kind in ("payload", "zero"):  # relative to the other runs
             centre = -float(prediction.moments[0])
         unlike.append(UnlikeRun(
-            int(which[k]), group.group.kind, group.group.name, group.group.parameters[p],
-            group.group.units[p], centre + float(c.values[k, p]),
-            float(np.sqrt(c.covariance[k, p, p])), centre + prediction.ends,
-            float(probability[:, k].min()),
+            int(which[k]), group.kind, group.name, group.parameters[p], group.units[p],
+            centre + float(c.values[k, p]), float(np.sqrt(c.covariance[k, p, p])),
+            centre + prediction.ends, float(probability[:, k].min()),
         ))  # fmt: skip
     return unlike
 
 
 def _explained(compared: Compared, k: int, noise: float, *, is_drive: bool) -> float:
-    """Return what a difference of a group explains of a run or unit: chi^2 less 2 for each.
+    """Return what a difference of a group explains of a run or unit: chi^2 less 2 each (Akaike).
 
     The run's own errors are those of a common noise. Only drive terms vary between alike runs:
     gains, payloads and zeros need a cause.
@@ -324,22 +297,22 @@ def _explained(compared: Compared, k: int, noise: float, *, is_drive: bool) -> f
     if is_drive:
         V = V + np.diag(np.maximum(std**2 - np.diag(C), 0.0))
     away = compared.values[k] - mean
-    return float(away @ np.linalg.solve(V, away)) - _PENALTY * len(away)
+    return float(away @ np.linalg.solve(V, away)) - 2.0 * len(away)
 
 
 def _is_compared(group: RunsOf, which: Array, *, is_unit: bool) -> Array:
     """Return which runs or units can be compared in a group, (m,).
 
     A payload is compared only if the run determines it: a run in which the last joints are at rest
-    has a large moment and a wrong mass in place of any other effect.
+    has a large moment and a wrong mass in place of any other effect. What all runs together do not
+    determine, no motion does.
     """
     runs = group.runs
     if group.group.kind != "payload":
         return np.ones(len(which), dtype=bool)
     H = np.array([runs.H[runs.unit == u].sum(axis=0) for u in which]) if is_unit else runs.H[which]
-    alone, together = (
-        np.diagonal(covariance_of(x, runs.scale), axis1=-2, axis2=-1)
+    is_open, is_open_in_all = (
+        np.diagonal(covariance_of(x, runs.scale), axis1=-2, axis2=-1) > runs.scale**2
         for x in (H, runs.H.sum(axis=0))
     )
-    plausible = runs.scale**2  # what all runs do not determine, no motion does
-    return np.asarray(~np.any((alone > plausible) & (together <= plausible), axis=1))
+    return np.asarray(~np.any(is_open & ~is_open_in_all, axis=1))

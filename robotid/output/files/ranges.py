@@ -20,7 +20,7 @@ from robotid.base.versions import __version__
 from robotid.dynamics.friction_projection import project_friction
 from robotid.estimation.fitting.fitted import Identified
 from robotid.estimation.fitting.standard_errors import QUANTILE
-from robotid.estimation.variation.draws import (
+from robotid.estimation.variation.spread import (
     correlated_scores,
     possible_draws,
     root_of,

@@ -17,8 +17,7 @@ from robotid.diagnosis.residual.term_trials import take_sample
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.prediction import inverse_dynamics
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.identification.pipeline import with_drives
 from robotid.robot.drives import wanted_families
 from robotid.robot.examples import example_urdf

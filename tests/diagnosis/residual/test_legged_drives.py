@@ -12,8 +12,7 @@ from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.constraint_rows import without_forces
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.fit import solve_recordings
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.robot.constraints import Contact
 from robotid.robot.drives import Lag, LoadFriction, Stribeck
 from robotid.robot.examples import example_urdf

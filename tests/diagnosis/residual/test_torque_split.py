@@ -27,7 +27,7 @@ from robotid.diagnosis.residual.torque_split import (
 from robotid.dynamics.prediction import predict, remember
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.fitting.evaluation import evaluate_logs
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import hold_log
 from robotid.robot.drives import Harmonic, Hat, Lag, LoadFriction, Presliding, Spring, Stribeck
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

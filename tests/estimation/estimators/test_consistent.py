@@ -14,8 +14,8 @@ from robotid.estimation.estimators import WLS, Consistent
 from robotid.estimation.estimators.consistent_fit import Constraints, Subspace, slabs
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.interior_point import Entropic
-from robotid.estimation.fitting.chosen_estimator import make_constraints
 from robotid.estimation.fitting.estimator_settings import ConstraintSettings
+from robotid.estimation.fitting.fit import make_constraints
 from robotid.robot.geometry import body_boxes
 from robotid.robot.parameters import ParameterLayout, inertial_from_pseudo_inertia, pseudo_inertia
 

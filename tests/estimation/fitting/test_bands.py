@@ -109,19 +109,14 @@ def test_a_validation_log_that_was_fitted_has_the_noise_of_the_fitted_ones(found
     assert (apart[0].noise != apart[1].noise).all()
 
 
-def test_a_row_on_the_edge_of_the_band_lies_in_it():
+def test_coverage_is_of_used_rows_and_a_row_on_the_edge_lies_in_the_band():
     band = TorqueBand(np.arange(3), np.zeros((3, 1)), np.ones(1))
     edge = 1.96 * np.array([[1.0 + 1e-12], [1.0 + 1e-6], [0.5]])
     assert band.coverage(edge, np.zeros((3, 1)), np.ones((3, 1), bool)) == pytest.approx(2 / 3)
-
-
-def test_rows_that_are_not_used_do_not_count():
     band = TorqueBand(np.array([0, 2]), np.zeros((2, 2)), np.ones(2))
     tau = np.array([[0.0, 9.0], [50.0, 50.0], [9.0, 9.0]])
     mask = np.array([[True, False], [True, True], [True, False]])
-    share = band.coverage(tau, np.zeros((3, 2)), mask)
-    assert share[0] == 0.5
-    assert np.isnan(share[1])
+    np.testing.assert_array_equal(band.coverage(tau, np.zeros((3, 2)), mask), [0.5, np.nan])
 
 
 def coupled_fit(rng, free_flyer=False):
@@ -141,10 +136,8 @@ def coupled_fit(rng, free_flyer=False):
             np.arange(count) / 50, q, v, a, tau, JOINTS, 50.0, np.zeros(count, dtype=int)
         )
         mask = rng.random((count, 3 + base)) < 0.6
-        mask[:2, -3:], v[:2] = (
-            [True, False, False],
-            9.0,
-        )  # fast only where the other joint is not used
+        # fast only where the other joint is not used
+        mask[:2, -3:], v[:2] = [True, False, False], 9.0
         motion = replace(motion, v=v)
         fitted.append(SimpleNamespace(recording=SimpleNamespace(trajectory=motion, mask=mask)))
     size = len(model.layout.names)
@@ -163,15 +156,8 @@ def test_usual_friction_of_a_coupled_drive_is_over_the_rows_that_all_of_its_join
     found = coupled_fit(rng, free_flyer)
     ratios = np.array([1.0, 0.0, -2.5])
     rows = [(e.recording.mask[:, [-3, -1]]).all(axis=1) for e in found.fitted]
-    q, v = (
-        np.concatenate(
-            [
-                getattr(e.recording.trajectory, x)[r, -3:] @ ratios
-                for e, r in zip(found.fitted, rows, strict=True)
-            ]
-        )
-        for x in "qv"
-    )
+    motions = [(e.recording.trajectory, r) for e, r in zip(found.fitted, rows, strict=True)]
+    q, v = (np.concatenate([getattr(m, x)[r, -3:] @ ratios for m, r in motions]) for x in "qv")
     assert 10 < len(q) < 40
     curve = typical_friction(found, "pair")
     side = np.linspace(np.abs(v).min(), np.abs(v).max(), 20)

@@ -15,7 +15,7 @@ from robotid.estimation.fitting.evaluation import (
     predict,
     shares_rows,
 )
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import hold_log
 from robotid.robot.parameters import Coupling
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)

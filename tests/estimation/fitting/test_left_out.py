@@ -13,8 +13,7 @@ from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.evaluation import LEFT_OUT, logs_that_test
 from robotid.estimation.fitting.fit import solve_recordings
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.identification.pipeline import conclude
 from robotid.identification.summary import left_out_lines
 

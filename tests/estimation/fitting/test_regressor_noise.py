@@ -18,7 +18,7 @@ from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.estimators import OLS, WLS
 from robotid.estimation.fitting import regressor_noise
-from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.estimation.fitting.regressor_noise import (
     acceleration_noise,
     find_regressor_noise,
@@ -27,7 +27,6 @@ from robotid.estimation.fitting.regressor_noise import (
     without_noise,
 )
 from robotid.estimation.fitting.standard_errors import measured_errors
-from robotid.estimation.fitting.survey import hold_log
 from robotid.robot.model import RobotModel
 
 RATE, STEP = 200.0, 2 * np.pi / 2**11  # [Hz], [rad]
@@ -62,9 +61,8 @@ def recorded(model, motion, *, step=STEP, noise=0.01, seed=0, **more):
 
 def fitted(model, *logs):
     """Return recordings, what they come down to, and weighted least squares on them."""
-    recordings = Recordings(
-        model, structural_mapping(model), [hold_log(model, log, SIGNALS) for log in logs]
-    )
+    held = [hold_log(model, log, SIGNALS) for log in logs]
+    recordings = Recordings(model, structural_mapping(model), held)
     parts = recordings.reduce()
     whole = join(parts)
     return recordings, parts, whole, WLS(independent_share=recordings.share).fit(whole.factors)
@@ -188,10 +186,8 @@ def test_measured_velocities_have_no_noise_of_the_positions(planar, motion):
     t, q, _ = motion
     v = np.gradient(q, t, axis=0)
     log = recorded(planar, motion, v=v)
-    recordings = replace(
-        fitted(planar, log)[0],
-        fitted=[hold_log(planar, log, SignalSettings(velocity="measured"))],
-    )
+    held = hold_log(planar, log, SignalSettings(velocity="measured"))
+    recordings = replace(fitted(planar, log)[0], fitted=[held])
     whole = join(recordings.reduce())
     wls = WLS().fit(whole.factors)
     assert find_regressor_noise(recordings, whole, wls.theta, wls.sigma, wls.sigma) is None
@@ -246,28 +242,15 @@ def test_a_finding_names_the_joints_of_coarse_steps_and_the_worst_inertial_sum(
     layout = SimpleNamespace(n_inertial=2, prismatic={"d"})
     model = SimpleNamespace(joints=tuple("abcd"), layout=layout)
     mapping = SimpleNamespace(K=K, base_names=("x", "y", "z"))
-    found = list(
-        encoder_noise(SimpleNamespace(regressor_noise=noise, model=model, mapping=mapping))
-    )
+    fit_of = SimpleNamespace(regressor_noise=noise, model=model, mapping=mapping)
+    found = list(encoder_noise(fit_of))
     assert len(found) == (severity is not None)
     if not found:
         return
     (finding,) = found
     assert (finding.severity, finding.where) == (severity, "a, c, d")
-    assert finding.message.startswith(
-        f"a, c, d: the position is quantised in steps of up to {coarsest}. "
-    )
-    size = abs(shift) / 0.75
-    assert (
-        f"40 % of the RMS acceleration and shifts z by {size:.1f} standard errors"
-        in finding.message
-    )
-    assert Figures(finding) == pytest.approx(
-        {
-            "step_a": steps[0],
-            "step_c": steps[2],
-            "step_d": steps[3],
-            "std_errors": size,
-            "share_pct": 40,
-        }
-    )
+    size, text = abs(shift) / 0.75, finding.message
+    assert text.startswith(f"a, c, d: the position is quantised in steps of up to {coarsest}. ")
+    assert f"40 % of the RMS acceleration and shifts z by {size:.1f} standard errors" in text
+    of_joints = {"step_a": steps[0], "step_c": steps[2], "step_d": steps[3]}
+    assert Figures(finding) == pytest.approx(of_joints | {"std_errors": size, "share_pct": 40})

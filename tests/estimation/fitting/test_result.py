@@ -65,7 +65,7 @@ def test_intervals_are_each_value_s_own_quantile_times_its_own_error():
     assert Fit.standard_interval.fget(found).tolist() == [[5.0, 9.0], [-np.inf, np.inf]]
 
 
-def test_wls_is_overfitted_where_it_predicts_every_unseen_log_by_a_fifth_worse():
+def test_wls_is_overfitted_where_it_predicts_every_unseen_log_by_a_fifth_worse(identified):
     def log(is_refitted=False, **errors):
         metrics = {
             name: SimpleNamespace(
@@ -76,7 +76,7 @@ def test_wls_is_overfitted_where_it_predicts_every_unseen_log_by_a_fifth_worse()
         return SimpleNamespace(is_refitted=is_refitted, metrics=metrics)
 
     def overfitted(*logs):
-        return Fit.overfitted.func(SimpleNamespace(validation=logs))
+        return replace(identified, validation=logs).overfitted
 
     first = log(a=(1.0, 1.21), b=(2.0, 2.39), c=(3.0, 9.0))
     second = log(a=(0.5, 0.61), b=(1.0, 9.0), c=(3.0, 3.0))

@@ -15,9 +15,8 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.prepared_logs import base_problem
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.recorded import Recordings, survey_log
 from robotid.estimation.fitting.robust import LOSSES, find_outliers, loss_slope, loss_weight
-from robotid.estimation.fitting.survey import survey_log
 from robotid.identification.pipeline import conclude
 
 NOISE = np.array([6.0, 3.0, 0.9])
@@ -113,6 +112,22 @@ def test_outliers_are_named_with_time_joint_and_torque(model, logs):
     assert [o.size for o in found] == sorted((o.size for o in found), reverse=True)
 
 
+def evaluated(model, t, v, a, tau, predicted, *, cutoff, segment=None, mask=True, path=""):
+    """Return the evaluation of a log by figures that are given."""
+    segment = np.zeros(len(t), dtype=int) if segment is None else segment
+    recording = SimpleNamespace(
+        trajectory=Trajectory(t, v, v, a, tau, model.joints, 100.0, segment),
+        mask=np.broadcast_to(mask, tau.shape), log=Log(t, v, tau, model.joints, path=path),
+        signals=SignalSettings(cutoff=cutoff),
+    )  # fmt: skip
+    return SimpleNamespace(recording=recording, torques={"estimate": predicted})
+
+
+def alternating(count, every, size):
+    """Return rows of one size whose sign changes."""
+    return np.where(np.arange(count)[:, None] % (2 * every) < every, 1.0, -1.0) * size
+
+
 def test_a_row_is_an_outlier_by_the_residual_and_the_torque_of_its_own_joint(model):
     """From 12 times the typical residual and a tenth of the torque on, in each log by itself."""
     t, torque = np.arange(400) / 100, np.array([100.0, 10.0, 1.0])
@@ -123,32 +138,27 @@ def test_a_row_is_an_outlier_by_the_residual_and_the_torque_of_its_own_joint(mod
         (1, 1): {20: 1.7, 120: 1.9},  # 11.5 and 12.8 typical residuals
         (1, 0): {300: -11.0},
     }
-    evaluations = []
+    evaluations, v = [], np.ones((400, 3))
     for k in range(2):
-        predicted = np.where(np.arange(400)[:, None] % 2, 1.0, -1.0) * torque
+        predicted = alternating(400, 1, -torque)
         predicted[:, 0] = torque[0]  # a constant load is a torque, too
-        tau = predicted + 0.2 * np.where(np.arange(400)[:, None] % 4 < 2, 1, -1) * [1, 0.5, 0.01]
+        tau = predicted + 0.2 * alternating(400, 2, np.array([1.0, 0.5, 0.01]))
         mask = np.ones((400, 3), dtype=bool)
         mask[350, 2] = False
         for (log, j), rows in off.items():
             for row, size in rows.items() if log == k else ():
                 tau[row, j] = predicted[row, j] + size
-        v = np.ones((400, 3))
-        motion = Trajectory(t, v, v, 0 * v, tau, model.joints, 100.0, np.zeros(400, dtype=int))
-        log = Log(t, v, tau, model.joints, path=f"some/{k}.csv")
-        recording = SimpleNamespace(
-            trajectory=motion, mask=mask, log=log, signals=SignalSettings(cutoff=5.0)
-        )
-        evaluations.append(SimpleNamespace(recording=recording, torques={"estimate": predicted}))
-    found = find_outliers(model, evaluations, truth(model))
+        given = {"cutoff": 5.0, "mask": mask, "path": f"some/{k}.csv"}
+        evaluations.append(evaluated(model, t, v, 0.0 * v, tau, predicted, **given))
+    outliers = find_outliers(model, evaluations, truth(model))
     wanted = [
         ("0.csv", 2, 60, -0.15, 2), ("0.csv", 2, 200, 0.13, 1), ("1.csv", 0, 300, -11.0, 1),
         ("1.csv", 1, 120, 1.9, 1),
     ]  # fmt: skip
-    assert [(o.log, model.joints.index(o.joint), round(100 * o.t), o.rows) for o in found] == [
+    assert [(o.log, model.joints.index(o.joint), round(100 * o.t), o.rows) for o in outliers] == [
         (log, j, row, rows) for log, j, row, _, rows in wanted
     ]
-    for outlier, (log, j, row, size, _) in zip(found, wanted, strict=True):
+    for outlier, (log, j, row, size, _) in zip(outliers, wanted, strict=True):
         assert outlier.predicted == evaluations[int(log[0])].torques["estimate"][row, j]
         assert outlier.torque == pytest.approx(outlier.predicted + size)
         assert outlier.size == pytest.approx(abs(size) / usual[j])
@@ -206,24 +216,18 @@ def test_a_reversal_excuses_the_step_of_coulomb_friction_of_its_own_joint(model)
     """Where |v| <= |a| / cutoff, an error is counted beyond twice the joint's friction."""
     t, pi = np.arange(400) / 100, truth(model)
     step = 2 * pi[[model.layout.names.index(f"{joint}.coulomb") for joint in model.joints]]
-    typical, off = 1.4826 * np.array([0.2, 0.3, 0.5]), np.zeros((400, 3))
+    size = np.array([0.2, 0.3, 0.5])
+    typical, off = 1.4826 * size, np.zeros((400, 3))
     slow = {(60, 0): 0.19, (120, 0): 0.21, (60, 1): 0.2, (180, 1): 0.0, (60, 2): 0.1, (240, 2): 0.3}
     for k, (row, j) in enumerate(slow):
         off[row, j] = step[j] + (11.0, 12.5, 13.5, 11.5, 14.5, 11.9)[k] * typical[j]
     v, a = -np.ones((400, 3)), np.zeros((400, 3))
     for (row, j), speed in slow.items():
         v[row, j], a[row, j] = -speed, 1.0
-    predicted = np.where(np.arange(400)[:, None] % 2, 3.0, -3.0) * np.ones(3)
-    left = typical / 1.4826 * np.where(np.arange(400)[:, None] % 4 < 2, 1, -1)
-    tau = predicted + np.where(off > 0, off, left)
-    motion = Trajectory(t, v, v, a, tau, model.joints, 100.0, np.zeros(400, dtype=int))
-    recording = SimpleNamespace(
-        trajectory=motion, mask=np.ones((400, 3), dtype=bool),
-        log=Log(t, v, tau, model.joints), signals=SignalSettings(cutoff=5.0),
-    )  # fmt: skip
-    evaluation = SimpleNamespace(recording=recording, torques={"estimate": predicted})
-    found = find_outliers(model, [evaluation], pi)
-    sizes = {(round(100 * o.t), model.joints.index(o.joint)): o.size for o in found}
+    predicted = alternating(400, 1, -3.0 * np.ones(3))
+    tau = predicted + np.where(off > 0, off, alternating(400, 2, size))
+    outliers = find_outliers(model, [evaluated(model, t, v, a, tau, predicted, cutoff=5.0)], pi)
+    sizes = {(round(100 * o.t), model.joints.index(o.joint)): o.size for o in outliers}
     wanted = {(60, 1): 13.5, (60, 2): 14.5}  # excused in part; in full beside a reversal
     wanted |= {(120, 0): step[0] / typical[0] + 12.5, (240, 2): step[2] / typical[2] + 11.9}
     assert sizes == pytest.approx(wanted)
@@ -235,29 +239,22 @@ def test_a_joint_that_stops_reverses_in_the_filtered_motion(model):
     The velocity of joint 1 changes its sign between rows 109 and 110, that of joint 2 between rows
     404 and 405: within 0.125 s at a cut-off of 8 Hz are 97 to 122, and 392 to 417.
     """
-    t, pi = 12.0 + np.arange(600) / 100, truth(model)
+    t, pi, size_of = 12.0 + np.arange(600) / 100, truth(model), np.array([0.2, 0.3, 0.5])
     step = 2 * pi[[model.layout.names.index(f"{joint}.coulomb") for joint in model.joints]]
-    typical = 1.4826 * np.array([0.2, 0.3, 0.5])
     v = np.column_stack([np.full(600, 0.4), 13.095 - t, 0.01 * (t - 16.045)])
-    predicted = np.where(np.arange(600)[:, None] % 2, 3.0, -3.0) * np.ones(3)
-    tau = predicted + typical / 1.4826 * np.where(np.arange(600)[:, None] % 4 < 2, 1, -1)
+    predicted = alternating(600, 1, -3.0 * np.ones(3))
+    tau = predicted + alternating(600, 2, size_of)
 
     def size(row, j, error, segment=None):
         """Return the size of an outlier with an error in typical ones, None if it is not found."""
         off = tau.copy()
-        off[row, j] = predicted[row, j] + error * typical[j]
-        segment = np.zeros(600, dtype=int) if segment is None else segment
-        motion = Trajectory(t, v, v, 0.0 * v, off, model.joints, 100.0, segment)
-        recording = SimpleNamespace(
-            trajectory=motion, mask=np.ones((600, 3), dtype=bool),
-            log=Log(t, v, tau, model.joints), signals=SignalSettings(cutoff=8.0),
-        )  # fmt: skip
-        evaluation = SimpleNamespace(recording=recording, torques={"estimate": predicted})
-        found = find_outliers(model, [evaluation], pi)
-        assert [model.joints.index(o.joint) for o in found] == [j] * len(found)
-        return found[0].size if found else None
+        off[row, j] = predicted[row, j] + error * 1.4826 * size_of[j]
+        evaluation = evaluated(model, t, v, 0.0 * v, off, predicted, cutoff=8.0, segment=segment)
+        outliers = find_outliers(model, [evaluation], pi)
+        assert [model.joints.index(o.joint) for o in outliers] == [j] * len(outliers)
+        return outliers[0].size if outliers else None
 
-    steps = step / typical
+    steps = step / (1.4826 * size_of)
     for first, last, j in ((97, 122, 1), (392, 417, 2)):
         for row in (first, last):
             assert size(row, j, steps[j] + 11.0) is None

@@ -2,6 +2,7 @@
 
 import pickle
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -18,11 +19,10 @@ from robotid.data.signal_settings import LogUnits, SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import join
 from robotid.dynamics.simulation.motions import random_fourier
-from robotid.dynamics.torque import joint_torque_regressor, mass_regressor
+from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.estimators import WLS
-from robotid.estimation.fitting import survey
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import ReducedPiece, hold_log, survey_log
+from robotid.estimation.fitting import recorded as survey
+from robotid.estimation.fitting.recorded import Recordings, hold_log, reduce_piece, survey_log
 from robotid.robot.closure import Chains
 from robotid.robot.constraints import Contact
 from robotid.robot.drives import Cubic
@@ -56,9 +56,9 @@ def long_log(model, path, signals, *, start=None, end=None, length=LENGTH, **rea
 
 
 def pieces_of(log):
-    """Return the pieces of a log, ready to be reduced."""
+    """Return what reduces each piece of a log."""
     mapping = structural_mapping(log.model)
-    return [ReducedPiece(piece, mapping) for piece in log.pieces]
+    return [partial(reduce_piece, piece, mapping=mapping) for piece in log.pieces]
 
 
 def assert_alike(model, path, signals, *, start=None, end=None, **reading):
@@ -67,7 +67,7 @@ def assert_alike(model, path, signals, *, start=None, end=None, **reading):
     found = long_log(model, path, signals, start=start, end=end, **reading)
     whole = hold_log(model, read_log(path, model.joints, start=start, end=end, **reading), signals)
     wanted = join(Recordings(model, mapping, [whole]).reduce())
-    joined = join([piece.reduce() for piece in pieces_of(found)])
+    joined = join([reduced() for reduced in pieces_of(found)])
     assert found.signals == whole.signals
     assert joined.samples == wanted.samples
     np.testing.assert_array_equal(joined.factors.rows, wanted.factors.rows)
@@ -161,6 +161,18 @@ def test_full_turns_are_taken_out_of_each_piece(tmp_path):
     assert np.any(turned, axis=0).tolist() == free.tolist()
 
 
+def test_a_locked_joint_has_the_positions_of_all_windows(robot, recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(survey, "WINDOW", 100)
+    path = tmp_path / "run.csv"
+    write_log(recording, path)
+    held, *moving = robot.joints
+    model = RobotModel.from_urdf(robot.tree.path, joints=moving, locked={held: 0.0})
+    reading = {"robot": model.tree.movable}
+    found = long_log(model, path, SignalSettings(), **reading).locked
+    rows = np.r_[0:100, 950:1050, 1900:2000]
+    np.testing.assert_allclose(found[held], recording.q[rows, 0], rtol=1e-12)
+
+
 def spoilt(recording, tmp_path, name, row, value):
     table = {"time": recording.t.copy()}
     for j, joint in enumerate(recording.joints):
@@ -178,13 +190,13 @@ def test_a_hole_in_the_last_piece_is_named_by_its_row_in_the_file(
     path = spoilt(recording, tmp_path, "tau_elbow_joint", 1801, np.nan)
     layout, table = lay_out(path, robot.joints)
     short = replace(layout, notes=())
-    monkeypatch.setattr(survey, "_WINDOW", 100)
+    monkeypatch.setattr(survey, "WINDOW", 100)
     window = (2.0, None)
     log = survey_log(short, table, robot, SignalSettings(cutoff=None), window, length=LENGTH)
     pieces = pieces_of(log)
-    pieces[-2].reduce()
+    pieces[-2]()
     with pytest.raises(DataError, match=r"tau_elbow_joint is NaN at row 1801 \(t = ") as found:
-        pieces[-1].reduce()
+        pieces[-1]()
     assert found.value.code == "not_finite"
 
 
@@ -199,36 +211,19 @@ def test_time_must_increase_where_pieces_meet_too(robot, recording, tmp_path, ro
     assert f"t[{row}]" in str(in_pieces.value)
 
 
-def test_samples_have_the_regressor_of_their_mass_matrix(robot, recording, tmp_path):
-    """Of two logs, in memory and in pieces."""
-    mapping, signals = structural_mapping(robot), SignalSettings(cutoff=None, trim=0.0)
-    logs = [recording.window(start, start + 0.8) for start in (1.0, 3.0)]
-    held = [hold_log(robot, log, signals) for log in logs]
-    q = np.concatenate([log.whole.trajectory.q for log in held])
-    wanted = mass_regressor(robot, q)[..., mapping.independent]
-    for k, log in enumerate(logs):
-        write_log(log, tmp_path / f"{k}.csv")
-    read = [long_log(robot, tmp_path / f"{k}.csv", signals, length=30) for k in range(2)]
-    for own in (held, read):
-        recordings = Recordings(robot, mapping, own)
-        found = [sample.mass_regressor for sample in recordings.problem(with_mass=True).samples()]
-        np.testing.assert_allclose(np.array(found), wanted, atol=1e-9)
-        assert next(recordings.problem().samples()).mass_regressor is None
-
-
 def test_pieces_travel_as_they_are(robot, recording, tmp_path):
     path = tmp_path / "run.parquet"
     write_log(recording, path)
     pieces = pieces_of(long_log(robot, path, SignalSettings()))
     for piece, again in zip(pieces, pickle.loads(pickle.dumps(pieces)), strict=True):
-        np.testing.assert_array_equal(again.reduce().factors.R, piece.reduce().factors.R)
+        np.testing.assert_array_equal(again().factors.R, piece().factors.R)
     # the model and the mapping go along once
     assert len(pickle.dumps(pieces)) < len(pickle.dumps(pieces[:1])) + 1000 * len(pieces)
 
 
 def test_the_pieces_of_a_log_have_the_bias_of_all_rests_of_its_windows(monkeypatch, tmp_path):
     """The robot moves in the first window, rests in the middle one and a part of the last one."""
-    monkeypatch.setattr(survey, "_WINDOW", 200)
+    monkeypatch.setattr(survey, "WINDOW", 200)
     robot = RobotModel.from_urdf(example_urdf("solo12.urdf"), free_flyer=True, terms=())
     t = 3.0 + 0.01 * np.arange(1000)
     rests = ((t > 6.9) & (t < 9.1)) | (t > 11.495)

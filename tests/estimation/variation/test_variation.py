@@ -10,8 +10,7 @@ from helpers.synthetic import truth
 from robotid.diagnosis.verdict.fit_findings import unlike_findings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.fit import solve_recordings, sums_with_zeros
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.estimation.variation.groups import (
     Group,
     RunsOf,
@@ -252,20 +251,24 @@ def test_a_payload_is_compared_only_in_runs_that_determine_it():
     x = 0.3 * rng.normal(size=(7, 4))
     x[6] += 40.0 * along
 
-    def unlike(weak, kind="payload", of_others=known):
-        H = np.tile(100.0 * of_others, (7, 1, 1))
+    def unlike(weak, kind="payload", of_others=known, unit=(0,) * 7, run=tuple(range(7))):
+        H = np.tile(100.0 * of_others, (len(run), 1, 1))
         H[6] = (100.0 - weak) * np.outer(along, along) + weak * known
         names = ("m", "mcx", "mcy", "mcz")
         group = Group(kind, "tool", tuple(f"tool.{n}" for n in names), ("kg",) * 4, np.eye(4), (0,))
-        runs = Runs(H, np.einsum("kij,kj->ki", H, x), np.zeros(7, int), np.ones(4))
-        own = vary(list("abcdefg"), (RunsOf(group, np.zeros(4), runs, 1.0),)).unlike
-        return [(each.run, each.kind) for each in own]
+        runs = Runs(H, np.einsum("kij,kj->ki", H, x[list(run)]), np.array(unit), np.ones(4))
+        own = vary(list("abcdefgh")[: len(run)], (RunsOf(group, np.zeros(4), runs, 1.0),))
+        return [(each.run, each.kind) for each in own.unlike_units or own.unlike]
 
     # sd of m and mcz: sqrt(0.5 / 100 + 0.5 / weak); 1 at weak = 0.5025; of mcx: 1 / sqrt(weak)
     assert unlike(1.1) == [(6, "payload")]
     assert unlike(0.9) == []  # mcx: 1.05
     assert unlike(0.9, "drive") == [(6, "drive")]
     assert unlike(0.9, of_others=np.diag([1.0, 0, 0, 1])) == [(6, "payload")]  # no run has mcx
+    # units of a run each, the last one with a second run that determines the payload
+    every, second = tuple(range(7)), (*range(7), 6)
+    assert unlike(0.9, unit=every) == []
+    assert unlike(0.9, unit=second, run=second) == [(6, "payload")]
 
 
 def test_gains_are_of_the_rows_of_joints_behind_those_of_a_floating_base():
