@@ -1,6 +1,6 @@
 """The content of a report: on an identification from torques, and on one by simulation."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from html import escape
 from pathlib import Path
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from robotid.base.files import write_text
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.data.signal_settings import SignalSettings
@@ -22,7 +23,7 @@ from robotid.identification.closed_loop.position_errors import (
     PositionEvaluation,
     pool_positions,
 )
-from robotid.identification.result import TorqueIdentification
+from robotid.identification.result import Identification, TorqueIdentification
 from robotid.identification.summary import left_out_lines
 from robotid.output.files.entries import loop_parameters
 from robotid.output.pages.html import (
@@ -44,7 +45,7 @@ from robotid.output.pages.html import (
 from robotid.output.report import pictures, tables
 from robotid.output.report.errors import POSITION, TORQUE, Errors, errors_of, worst_errors
 from robotid.output.report.next_steps import Origin
-from robotid.output.report.report_page import Report, Residual, curves_section, drawn
+from robotid.output.report.report_page import Report, Residual, curves_section, drawn, page_of
 
 if TYPE_CHECKING:
     from robotid.identification.closed_loop.loop_result import PositionIdentification
@@ -52,6 +53,26 @@ if TYPE_CHECKING:
 _SELECTED = (
     ("joint", "code", "joint"), ("terms", "text", "terms"), ("shape parameters", "text", "shapes"),
 )  # fmt: skip
+
+
+def write_report(
+    found: Identification,
+    target: str | Path,
+    *,
+    files: Mapping[str, str] | None = None,
+    origin: Origin | None = None,
+) -> Path:
+    """Write the report of an identification as one HTML file, with links to files by their kind."""
+    at, links = origin or Origin(), files or {}
+    replay = links.get("replay", "")
+    if isinstance(found, TorqueIdentification):
+        report = torque_report(found, at, replay)
+    else:  # modules of the simulation are imported here
+        from robotid.identification.closed_loop.loop_result import PositionIdentification
+
+        assert isinstance(found, PositionIdentification)
+        report = position_report(found, at, replay)
+    return write_text(page_of(found, report, at, links), target)
 
 
 def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "") -> Report:

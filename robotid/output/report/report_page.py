@@ -10,13 +10,12 @@ from urllib.parse import quote, urlencode
 
 import numpy as np
 
-from robotid.base.files import write_text
 from robotid.base.findings import Cause, grouped, tally
 from robotid.base.typing import Array
 from robotid.base.versions import __version__
 from robotid.diagnosis.verdict.verdict import uses_line
 from robotid.estimation.fitting.evaluation import Evaluated
-from robotid.identification.result import Identification, TorqueIdentification
+from robotid.identification.result import Identification
 from robotid.identification.summary import verdict_cell
 from robotid.output.pages.html import (
     POINTS,
@@ -69,29 +68,8 @@ class Report:
     bodies: str = ""  # links, URDF and identified; "" if there are none
 
 
-def write_report(
-    found: Identification,
-    target: str | Path,
-    *,
-    files: Mapping[str, str] | None = None,
-    origin: Origin | None = None,
-) -> Path:
-    """Write the report of an identification as one HTML file, with links to files by their kind."""
-    at, links = origin or Origin(), files or {}
-    from robotid.output.report.report_content import position_report, torque_report
-
-    replay = links.get("replay", "")
-    if isinstance(found, TorqueIdentification):
-        report = torque_report(found, at, replay)
-    else:  # modules of the simulation are imported here
-        from robotid.identification.closed_loop.loop_result import PositionIdentification
-
-        assert isinstance(found, PositionIdentification)
-        report = position_report(found, at, replay)
-    return write_text(_page(found, report, at, links), target)
-
-
-def _page(found: Identification, report: Report, origin: Origin, files: Mapping[str, str]) -> str:
+def page_of(found: Identification, report: Report, origin: Origin, files: Mapping[str, str]) -> str:
+    """Return the HTML of the report."""
     rows, verdicts = found.model.row_names, found.verdict.to_dict()["per_joint"]
     definition, after = report.errors
     tables = "".join(

@@ -18,7 +18,7 @@ from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.position_errors import run_open_loop
 from robotid.identification.closed_loop.stages import fit_loops, stated_loops
 from robotid.output.files.entries import build_result
-from robotid.output.report.report_page import write_report
+from robotid.output.report.report_content import write_report
 from robotid.robot.drives import Coulomb, Offset, PositionCoulomb, Viscous
 
 NOISE = 1e-3  # [rad]: with less, that MuJoCo's friction is a little soft shows beside the errors

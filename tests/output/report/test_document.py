@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from robotid.output.report.report_page import write_report
+from robotid.output.report.report_content import write_report
 
 VOID = {"meta", "br", "wbr", "link", "img", "input", "hr", "path", "use"}
 

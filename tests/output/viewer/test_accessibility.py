@@ -15,7 +15,7 @@ from robotid.base.findings import Finding
 from robotid.identification.pipeline import identify
 from robotid.output.files.entries import build_result
 from robotid.output.report.comparison import write_comparison
-from robotid.output.report.report_page import write_report
+from robotid.output.report.report_content import write_report
 from robotid.robot.model import RobotModel
 
 AXE = {"runOnly": {"type": "tag", "values": ["wcag2a", "wcag2aa"]}}
