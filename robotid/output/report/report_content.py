@@ -48,7 +48,7 @@ from robotid.output.report.next_steps import Origin
 from robotid.output.report.report_page import Report, Residual, curves_section, drawn, page_of
 
 if TYPE_CHECKING:
-    from robotid.identification.closed_loop.loop_result import PositionIdentification
+    from robotid.identification.closed_loop.from_commands import PositionIdentification
 
 _SELECTED = (
     ("joint", "code", "joint"), ("terms", "text", "terms"), ("shape parameters", "text", "shapes"),
@@ -68,7 +68,7 @@ def write_report(
     if isinstance(found, TorqueIdentification):
         report = torque_report(found, at, replay)
     else:  # modules of the simulation are imported here
-        from robotid.identification.closed_loop.loop_result import PositionIdentification
+        from robotid.identification.closed_loop.from_commands import PositionIdentification
 
         assert isinstance(found, PositionIdentification)
         report = position_report(found, at, replay)
