@@ -27,7 +27,6 @@ from robotid.robot.prior import prior_spread
 
 #: One instant of smooth motion: t [s], then q, v, a, tau, each of shape (n,).
 Instant = tuple[float, Array, Array, Array, Array]
-Observer = Callable[[int, "OnlineIdentifier"], None]
 
 _SLOWEST = 1e-5  # smallest cut-off over the rate
 _GAP_CYCLES = 0.25  # longest pause without a gap [periods of the cut-off]
