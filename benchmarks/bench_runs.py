@@ -45,7 +45,7 @@ from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.estimation.variation.groups import Group, RunsOf, runs_of, sums_of
 from robotid.estimation.variation.spread import Runs, SpreadModel, covariance_of, scores_to_values
 from robotid.estimation.variation.variation import SCORES, Variation, _parameters, vary
-from robotid.identification.closed_loop.loop_result import loop_runs
+from robotid.identification.closed_loop.from_commands import loop_runs
 from robotid.identification.pipeline import identify, with_drives
 from robotid.robot.drives import wanted_families
 from robotid.robot.examples import example_urdf

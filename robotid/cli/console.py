@@ -88,7 +88,6 @@ def window_name(name: str, entry: Mapping[str, Any]) -> str:
 
 
 def print_verdict(verdict: Mapping[str, Any]) -> None:
-    """Print a verdict."""
     from robotid.identification.summary import verdict_lines
 
     first, *others = verdict_lines(verdict)

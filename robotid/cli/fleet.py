@@ -80,7 +80,6 @@ class FleetUnit(Workload):
         return len(self.logs)  # which the progress counts
 
     def stated(self) -> Job:
-        """Return the job of the unit."""
         job = Job(Path()) if self.job is None else read_job(self.job)
         if isinstance(job.estimator, SimulationSettings):
             raise SettingsError(
@@ -313,7 +312,6 @@ class _Gathered:
         self._verdicts = Counter[str]()
 
     def add(self, rows: UnitRows) -> None:
-        """Add the result of a unit."""
         for row in rows:
             if row["status"] == "failed":
                 shown = {"unit": row["unit"], "log": row.get("log", ""), "error": row["error"]}

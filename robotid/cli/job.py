@@ -331,7 +331,6 @@ class Job(Settings):
 
 
 def read_job(path: str | Path) -> Job:
-    """Read a job file."""
     require_kind(path, (str, Path), "path", "the path of a job file")
     check_path(path)
     source = Path(path)
@@ -353,11 +352,11 @@ def read_job(path: str | Path) -> Job:
 
 def job_file(model: object) -> Job:
     """Return the job of a file that is given in place of a robot and its logs."""
-    if not isinstance(model, str | Path) or Path(model).suffix != ".toml":
-        raise SettingsError(
-            "no log is given, wanted the robot and its logs, or a job file (.toml) alone"
-        )
-    return read_job(model)
+    if isinstance(model, str | Path) and Path(model).suffix == ".toml":
+        return read_job(model)
+    raise SettingsError(
+        "no log is given, wanted the robot and its logs, or a job file (.toml) alone"
+    )
 
 
 def as_job(robot: Job | str | Path) -> Job:
@@ -406,7 +405,6 @@ def stated_path(text: str, where: str, folder: Path, *, expand: bool) -> Path:
 
 
 def number(word: str, flag: str, wanted: str = "a number", shown: str = "") -> float:
-    """Return the number of a word."""
     try:
         return float(word)
     except ValueError as error:
@@ -414,7 +412,6 @@ def number(word: str, flag: str, wanted: str = "a number", shown: str = "") -> f
 
 
 def pairs(words: Sequence[str], flag: str) -> dict[str, float]:
-    """Return numbers by joint."""
     return {
         name: number(text, flag, "JOINT=NUMBER", repr(f"{name}={text}" if text else name))
         for name, text in _once(words, flag).items()
@@ -464,19 +461,19 @@ class Flags:
     read: Mapping[str, Callable[[Any, str], Any]] = field(default_factory=dict)
 
     def add(self, parser: "argparse._ActionsContainer", wanted: Sequence[str] = ()) -> None:
-        """Add flags."""
         settings = self.defaults
         schema, about, values = settings.schema(), settings.paths(), settings.to_dict()
         for flag in wanted or self.keys:
             at, shown = self.keys[flag]
             kinds, key, value = _in(schema, at), about[at], _in(values, at)
             words, about_flag = key.words, dict[str, Any](metavar=shown)
+            is_repeated = kinds.count is None if isinstance(kinds, Entries) else dict in kinds
             if kinds == (bool,):
                 words = shown or words
                 about_flag = {"action": "store_const", "const": not flag.startswith("--no-")}
             elif not shown:
                 words, about_flag = key.text, {"choices": key.among}
-            elif _is_repeated(kinds):
+            elif is_repeated:
                 words += "; repeatable"
                 about_flag["action"] = "append"
             elif flag not in self.read and bool not in kinds:
@@ -486,7 +483,6 @@ class Flags:
             parser.add_argument(flag, help=words.replace("%", "%%"), **about_flag)
 
     def given(self, options: argparse.Namespace) -> list[str]:
-        """Return the flags that are given."""
         return [flag for flag in self.keys if getattr(options, _name(flag), None) is not None]
 
     def stated(self, options: argparse.Namespace, wanted: Sequence[str] = ()) -> dict[str, Any]:
@@ -507,11 +503,6 @@ def _in(table: Any, at: str) -> Any:  # noqa: ANN401
     for name in at.split("."):
         table = table.get(name) if isinstance(table, Mapping) else None
     return table
-
-
-def _is_repeated(kinds: Any) -> bool:  # noqa: ANN401
-    """Return whether a setting has several entries, so that its flag may be repeated."""
-    return kinds.count is None if isinstance(kinds, Entries) else dict in kinds
 
 
 def _reader(kinds: Any) -> Callable[[Any, str], Any]:  # noqa: ANN401
@@ -676,5 +667,4 @@ def _given(options: argparse.Namespace) -> list[str]:
 
 
 def _name(flag: str) -> str:
-    """Return the name of a flag in argparse."""
-    return flag[2:].replace("-", "_")
+    return flag[2:].replace("-", "_")  # in argparse

@@ -61,7 +61,8 @@ def run_track(job: Job, folder: str | Path, *, observer: Observer | None = None)
 def _summary(tracked: Track, job: Job, log: Log, history: str) -> dict[str, Any]:
     identifier = tracked.identifier
     model, mapping = identifier.model, identifier.mapping
-    converged, last = tracked.t[tracked.converged].tolist(), identifier.reading
+    pairs, last = zip(tracked.t.tolist(), tracked.readings, strict=True), identifier.reading
+    converged = [t for t, reading in pairs if reading.converged]
     units = [model.layout.units[i] for i in mapping.independent]
     rows = zip(mapping.base_names, mapping.expressions, last.theta.tolist(),
                last.std_error.tolist(), units, strict=True)  # fmt: skip

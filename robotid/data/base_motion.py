@@ -316,11 +316,10 @@ def base_state(
 
 
 def pose_jumps(t: Array, pose: Array) -> tuple[Array, Array, Array]:
-    """Return the jumps of a pose from one row to the next: rows, lengths and angles.
+    """Return the jumps of a pose (N, 7) from one row to the next: rows, lengths [m] and angles.
 
     A step is compared with the mean of the steps before and after it, and their difference with
     those of 32 rows on each side. A change of the speed, as by an impact, is no jump.
-    t (N,) [s], pose (N, 7) -> (k,) [m].
     """
     dt, sizes = np.diff(t), np.zeros((2, len(t)))
     if len(dt) < 3:
@@ -479,9 +478,8 @@ def inertial_state(
 ) -> tuple[Array, Array]:
     """Return twist (N, 6) and its time derivative (N, 6) of a base with an IMU, in base axes.
 
-    With the lever r of the IMU, its specific force f without bias and gravity g, the specific
-    force at the origin is f - alpha x r - w x (w x r), and dv/dt = that + g - w x v.
-    t (N,) [s], velocity (N, 3) [m/s], down (N, 3) [m/s^2].
+    With the lever r of the IMU, its specific force f without bias and gravity g, the specific force
+    at the origin is f - alpha x r - w x (w x r), and dv/dt = that + g - w x v.
     """
     w, f, r = values[:, :3], values[:, 3:], frame.lever
     f = f if frame.offset is None else f - frame.offset

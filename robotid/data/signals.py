@@ -178,11 +178,10 @@ def process_segments(
     own: slice = _ALL,
     speeds: Array | None = None,
 ) -> Trajectory:
-    """Return the smooth motion of segments without gaps, or of a part of them.
+    """Return the smooth motion of segments without gaps, or of a part of them: speeds (c, n).
 
-    The result for a part equals that for the whole, if the log has the rows of its segments
-    within ``filter_reach`` of the part.
-    speeds (c, n).
+    The result for a part equals that for the whole, if the log has the rows of its segments within
+    ``filter_reach`` of the part.
     """
     is_sharp = settings.cutoff is None and settings.friction_band == 0
     ratios = np.empty((0, len(log.joints))) if speeds is None or is_sharp else speeds
@@ -482,13 +481,12 @@ def _crossing(t: Array, x: Array, level: float) -> tuple[float, float]:
 def standing_motion(
     log: Log, max_gap: float, least: Array, fastest: Array, hardest: Array
 ) -> tuple[Trajectory, Array]:
-    """Return the means of a log over short blocks, and which of them are at rest.
+    """Return the means (K,) of a log over short blocks, and which of them are at rest.
 
     A block is a quarter of a second, or a row if the time steps are longer. Blocks in which a joint
-    is too fast, or is accelerated or decelerated too much, are left out. Consecutive blocks at rest
-    are joined: each pose at rest is one sample. There is no filter and no derivative: the speed is
-    the slope of the positions over the block, and 0 for a single row.
-    least (n,) [rad/s or m/s], fastest (n,), hardest (n,) [rad/s^2 or m/s^2] -> (K,).
+    is too fast, or is accelerated too much, are left out. Consecutive blocks at rest are one
+    sample. There is no filter: the speed is the slope of the positions over the block, and 0 for a
+    single row.
     """
     of_block, segment = _blocks(log.t, max_gap)
     first = np.flatnonzero(np.diff(of_block, prepend=-1))

@@ -246,12 +246,10 @@ def is_timely(log: Log, stated: float = 0.0) -> bool:
 
 @_once
 def velocity_lags(log: Log) -> tuple[float, Array]:
-    """Return the delays of measured velocities relative to the derivatives of the positions [s].
+    """Return the delay of measured velocities after the slopes of positions, and of each joint [s].
 
-    The delay minimises the distance between the measured velocity and the delayed derivative. It is
-    found on a uniform grid in segments without gaps and refined by a parabola. It is positive if
-    the measured velocity lags, and 0 if the joints are at rest.
-    -> (n,).
+    It minimises their distance, on a uniform grid in segments without gaps, refined by a parabola.
+    It is 0 if the joints are at rest.
     """
     v = _measured(log)
     step = float(np.median(np.diff(log.t)))

@@ -92,11 +92,10 @@ def base_mapping(
     preference: Array | None = None,
     rtol: float = RANK_TOLERANCE,
 ) -> BaseMapping:
-    """Return the base parameters of a regressor taken at random states.
+    """Return the base parameters of a regressor taken at random states (Gautier 1991).
 
     The columns are compared after multiplication by ``scales``, physical magnitudes. They are not
-    normalised, since a column of rounding errors would become a parameter. See Gautier (1991),
-    Numerical calculation of the base inertial parameters of robots.
+    normalised, since a column of rounding errors would become a parameter.
     """
     if W.ndim != 2 or W.shape[1] != len(names) or len(W) < len(names):
         raise DataError(f"W has shape {W.shape}, wanted at least {len(names)} rows of {len(names)}")

@@ -53,13 +53,10 @@ def predict(
     *,
     compiled: bool | None = None,
 ) -> list[Array]:
-    """Return the torque W theta, shape (N, n_rows) [N m, N], of each of several vectors.
-
-    Along a motion with constraints it is the torque that constraint forces cannot cause, P W theta.
+    """Return the torque W theta, (N, n_rows) [N m, N], of several vectors; constrained: P W theta.
 
     It is computed by the rows of the regressor for all vectors together, or, if the rows are not
-    compiled and the vectors are few, by inverse dynamics, once per vector. See Luh, Walker, Paul
-    (1980), On-Line Computational Scheme for Mechanical Manipulators.
+    compiled and the vectors are few, by inverse dynamics, once per vector (Luh, Walker, Paul 1980).
     """
     source = trajectory_rows(model, trajectory, None, compiled)
     stacked = np.column_stack(list(parameters))

@@ -385,9 +385,8 @@ def independent_share(signals: SignalSettings) -> float:
 def prefers_measured(model: RobotModel, logs: Sequence[Log], settings: SignalSettings) -> bool:
     """Return whether velocity = "auto" uses the measured velocities of a log.
 
-    Measured velocities that are coarsely quantised or inconsistent with the positions are not used.
-    Others are used if they predict the torque about as well as differentiated velocities. If the
-    log has too little motion for this comparison, they are used if they are not delayed.
+    They must be fine, consistent with the positions, and predict the torque about as well as
+    differentiated ones; with too little motion for this comparison, they must not be delayed.
     """
     if any(coarse_velocities(log) or unlike_velocities(log) for log in logs):
         return False

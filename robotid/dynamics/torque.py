@@ -79,8 +79,7 @@ def trajectory_regressor(
 def mass_regressor(model: RobotModel, q: Array) -> Array:
     """Return the regressor of D(q, pi) = mass_regressor @ pi, shape (N, n_rows, n_rows, p).
 
-    With drives, column j is W(q, 0, e_j) - W(q, 0, 0), where gravity and offsets cancel. See
-    Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (11), (13).
+    Column j is W(q, 0, e_j) - W(q, 0, 0), where gravity and offsets cancel (Tzvetkova, (11), (13)).
     """
     N, n = len(q), model.n_rows
     still = np.zeros((N, n))

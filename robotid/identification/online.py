@@ -6,7 +6,7 @@ filtered position, with a delay of one step. Innovations show noise, convergence
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import overload
 
@@ -14,6 +14,7 @@ import numpy as np
 import scipy.linalg
 
 from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.findings import listed
 from robotid.base.settings import NOT_NEGATIVE, POSITIVE, Settings, is_number, require_kind, setting
 from robotid.base.typing import Array, real_numbers
 from robotid.data.log import Log, Trajectory
@@ -27,6 +28,7 @@ from robotid.robot.prior import prior_spread
 
 #: One instant of smooth motion: t [s], then q, v, a, tau, each of shape (n,).
 Instant = tuple[float, Array, Array, Array, Array]
+Observer = Callable[[int, "OnlineIdentifier"], None]
 
 _SLOWEST = 1e-5  # smallest cut-off over the rate
 _GAP_CYCLES = 0.25  # longest pause without a gap [periods of the cut-off]
@@ -34,13 +36,7 @@ _SETTLE = 4.0  # time after a start or a gap before the first instant [delays]
 
 
 class LiveSignals:
-    """Converts samples of q and tau online into instants of q, v, a, tau.
-
-    Attributes:
-        delay: Delay of the instants after the samples [s].
-
-    is_continuous (n,).
-    """
+    """Converts samples of q and tau online into instants of q, v, a, tau."""
 
     def __init__(
         self, n: int, rate: float, cutoff: float, order: int, is_continuous: Array
@@ -63,6 +59,7 @@ class LiveSignals:
         A, B, C = self._M[:-1, :-1], self._M[:-1, -1:], self._M[-1:, :-1]
         inverse = np.linalg.inv(np.eye(order) - A)
         self._rest = (inverse @ B)[:, 0]  # state at a constant input of 1
+        # of the instants after the samples [s]
         self.delay = (float((C @ inverse @ inverse @ B)[0, 0]) + 1.0) * self._step
         self._warm = int(np.ceil(_SETTLE * self.delay / self._step))
         self._last: tuple[float, Array] | None = None
@@ -70,32 +67,17 @@ class LiveSignals:
         self._recent: list[Array] = []
         self._next, self._count = 0.0, 0
 
-    def push(self, t: float, q: Array, tau: Array) -> Iterator[Instant]:
+    def push(self, t: float, q: Array, tau: Array) -> list[Instant]:
         """Process a sample and return the delayed instants that it completes; typically one."""
-        # q (n,) [rad or m], tau (n,) [N m or N]
-        if q.shape != (self._n,) or tau.shape != (self._n,):
-            raise DataError(f"q has shape {q.shape} and tau {tau.shape}, wanted ({self._n},) each")
-        u = np.concatenate([q, tau])
-        if not (np.isfinite(t) and np.isfinite(u.sum())):
-            raise DataError(f"the sample at t = {t:g} s is not finite, so it was refused")
-        last = self._last
+        u, last = np.concatenate([q, tau]), self._last
         if last is not None:
-            if t <= last[0]:
-                raise DataError(f"t must increase, but {t:.15g} s follows {last[0]:.15g} s")
             jump = np.where(self._is_continuous, u[: self._n] - last[1][: self._n], 0.0)
             u[: self._n] -= 2 * np.pi * np.round(jump / (2 * np.pi))
         self._last = (t, u)
         if last is None or t - last[0] > self._gap:
-            self._restart(t, u)
-            return iter(())
-        return iter(self._advance(last, t, u))
-
-    def _restart(self, t: float, u: Array) -> None:
-        self._x = np.outer(self._rest, u)
-        self._recent, self._count, self._next = [], 0, t + self._step
-
-    def _advance(self, last: tuple[float, Array], t: float, u: Array) -> list[Instant]:
-        """Return the instants at the grid times up to t."""
+            self._x = np.outer(self._rest, u)
+            self._recent, self._count, self._next = [], 0, t + self._step
+            return []
         done = []
         while self._next <= t + 1e-9 * self._step:
             share = (self._next - last[0]) / (t - last[0])
@@ -136,6 +118,8 @@ def _bessel(order: int, cutoff: float, rate: float) -> Array:
 
 
 _LARGEST = 25.0  # largest squared innovation in the evidence [variances]
+_DRIFT = 4.0  # mean squared innovation without a change [variances]
+_MEMORY = 5.0  # time over which the noise level of each joint is averaged [s]
 _FIRST_NOISE = 0.1  # initial noise level, relative to the RMS torque of each row
 _SMALLEST_NOISE = 1e-4  # smallest noise level, relative to the RMS torque of each row
 _PSEUDO = 20.0  # weight of the initial noise level [samples]
@@ -145,15 +129,10 @@ _CONVERGED = 0.25  # variance of the prediction over that of the noise, below wh
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """A payload on the last body.
+    """A payload on the last body."""
 
-    Attributes:
-        parameters: Its ten inertial parameters in the body's frame, shape (10,).
-        std_error: Their standard errors, shape (10,).
-    """
-
-    parameters: Array
-    std_error: Array
+    parameters: Array  # its ten inertial parameters in the body's frame, shape (10,)
+    std_error: Array  # their standard errors, shape (10,)
 
     @property
     def mass(self) -> float:
@@ -170,22 +149,22 @@ class ChangeDetector:
     """CUSUM on squared innovations, row by row.
 
     With the squared innovation d_j^2 in units of its variance, the evidence is
-    g_j <- max(0, g_j + share (min(d_j^2, 25) - drift)), and a change is flagged when one g_j
+    g_j <- max(0, g_j + share (min(d_j^2, 25) - 4)), and a change is flagged when one g_j
     reaches the threshold. The onset of the change is the time at which that g_j last left 0.
 
     References:
         Page (1954), Continuous Inspection Schemes.
     """
 
-    def __init__(self, n: int, threshold: float, drift: float) -> None:
-        self.threshold, self.drift = threshold, drift
+    def __init__(self, n: int, threshold: float) -> None:
+        self.threshold = threshold
         self.evidence = np.zeros(n)
         self._onset = np.full(n, np.nan)
 
     def push(self, t: float, squares: Array, share: float) -> float | None:
         """Process one sample; return the onset of a change flagged now [s], else None."""
         # squares (n,)
-        evidence = self.evidence + share * (np.minimum(squares, _LARGEST) - self.drift)
+        evidence = self.evidence + share * (np.minimum(squares, _LARGEST) - _DRIFT)
         evidence[squares == 0.0] = self.evidence[squares == 0.0]
         starts = (self.evidence <= 0.0) & (evidence > 0.0)
         self._onset[starts] = t
@@ -203,23 +182,17 @@ class Innovations:
     The mean of innovation times residual is the variance of the noise, at any uncertainty of the
     parameters. For the detection of changes, ``model_error`` times each row's torque is added to
     its noise, since no model is exact.
-
-    Attributes:
-        variance: Noise variance of each row, shape (n,) [(N m)^2 or N^2].
-        ratio: Mean variance of the prediction, from the parameters' uncertainty, over that of the
-            noise, shape (n,); inf before the first sample.
-
-    rms (n,) [N m or N].
     """
 
-    def __init__(
-        self, rms: Array, dt: float, memory: float, model_error: float, detector: ChangeDetector
-    ) -> None:
+    def __init__(self, rms: Array, dt: float, model_error: float, detector: ChangeDetector) -> None:
+        # rms (n,) [N m or N]
         self._floor = (_SMALLEST_NOISE * np.maximum(rms, 1e-3 * rms.max())) ** 2 + 1e-300
+        # noise variance of each row, (n,) [(N m)^2 or N^2]
         self.variance = np.maximum((_FIRST_NOISE * rms) ** 2, self._floor)
+        # mean variance of the prediction, by the parameters' uncertainty, over that of the noise
         self.ratio = np.full(len(rms), np.inf)
         self._torque = rms**2
-        self._dt, self._memory, self._model_error = dt, memory / dt, model_error
+        self._dt, self._memory, self._model_error = dt, _MEMORY / dt, model_error
         self._samples = np.full(len(rms), _PSEUDO)
         self._detector = detector
 
@@ -238,24 +211,13 @@ class Innovations:
         used: Array,
         share: float,
     ) -> float | None:
-        """Process one sample; return the onset of a change flagged now [s], else None.
-
-        tau (n,) [N m or N], e (n,) [N m or N], residual (n,) [N m or N], uncertainty (n,)
-        [(N m)^2 or N^2], used (n,).
-        """
+        """Process one sample; return the onset of a change flagged now [s], else None."""
+        # tau, innovation e and residual (n,) [N m or N], uncertainty (n,) their squares, used (n,)
         expected = uncertainty + self.variance + self._model_error**2 * self._torque
         # before convergence, innovations do not indicate a change
         evidence = np.where(used & (self.ratio < _CONVERGED), e**2 / expected, 0.0)
-        self._update_noise(tau, e * residual, uncertainty, used)
-        return self._detector.push(t, evidence, share)
-
-    def forget_convergence(self) -> None:
-        """Reset the convergence, after the covariance was increased."""
-        self.ratio = np.full(len(self.ratio), np.inf)
-
-    def _update_noise(self, tau: Array, product: Array, uncertainty: Array, used: Array) -> None:
-        """Average noise and torque over the memory, and the variance ratio over one second."""
-        bounded = np.clip(product, 0.0, _CLIP * (uncertainty + self.variance))
+        # noise and torque are averaged over the memory, and the variance ratio over one second
+        bounded = np.clip(e * residual, 0.0, _CLIP * (uncertainty + self.variance))
         ratio = uncertainty / self.variance
         self._samples = np.minimum(self._samples + used, self._memory)
         gain = used / self._samples
@@ -265,6 +227,11 @@ class Innovations:
         averaged = np.where(known, self.ratio, ratio)
         averaged += min(1.0, self._dt) * (ratio - averaged)
         self.ratio = np.where(used, averaged, self.ratio)
+        return self._detector.push(t, evidence, share)
+
+    def forget_convergence(self) -> None:
+        """Reset the convergence, after the covariance was increased."""
+        self.ratio = np.full(len(self.ratio), np.inf)
 
 
 def payload_of(difference: Array, covariance: Array, columns: Array, spread: Array) -> Payload:
@@ -295,14 +262,9 @@ def load_spread(spread: Array) -> Array:
 _ARRAYS = {1: ("q", "tau"), 3: ("q", "v", "a", "tau")}  # by the number of arrays after t and q
 _OVERSAMPLED = 12.0  # estimator updates per period of the cut-off
 _STORED_EVERY = 0.1  # time between stored states, for the reset after a change [s]
-_STORED = 30  # number of stored states
 _REOPENED = 0.1  # change of every parameter after a change, relative to its prior spread
 _ORDER = 4  # of the causal filter
-_DRIFT = 4.0  # mean squared innovation without a change [variances]
-_MEMORY = 5.0  # time over which the noise level of each joint is averaged [s]
 _ROWS = 20.0  # rate of the rows of the history [Hz]
-
-Observer = Callable[[int, "OnlineIdentifier"], None]
 
 
 @dataclass(frozen=True)
@@ -311,12 +273,7 @@ class OnlineSettings(Settings):
 
     rate: float = setting(200.0, "approximate rate of the samples [Hz]", within=POSITIVE)
     cutoff: float = setting(8.0, "cut-off of the causal filter [Hz]", within=POSITIVE)
-    min_velocity: float = setting(
-        0.02,
-        "speed below which a joint's row is not used if Coulomb friction is identified [rad/s]; "
-        "for prismatic joints as in ``SignalSettings``",
-        within=NOT_NEGATIVE,
-    )
+    min_velocity: float = setting(0.02, "as of ``SignalSettings`` [rad/s]", within=NOT_NEGATIVE)
     warmup: float = setting(
         1.0,
         "time of motion before the first estimate, which scales the drive terms [s]",
@@ -340,42 +297,25 @@ class OnlineSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """The estimate at one time.
+    """The estimate at one time."""
 
-    Attributes:
-        t: The time of the estimate: that of the newest sample minus the delay [s].
-        theta: Base parameters, shape (b,).
-        std_error: Their standard errors, shape (b,).
-        sigma: Noise level of each joint, shape (n,) [N m or N].
-        excitation: Reduction of the parameters' prior variance by the motion so far, mean over the
-            parameters, 0 to 1.
-        converged: Whether the parameters' uncertainty adds less than half a noise level to the
-            predicted torque.
-    """
-
-    t: float
-    theta: Array
-    std_error: Array
-    sigma: Array
-    excitation: float
+    t: float  # the time of the estimate: that of the newest sample minus the delay [s]
+    theta: Array  # base parameters, shape (b,)
+    std_error: Array  # their standard errors, shape (b,)
+    sigma: Array  # noise level of each joint, shape (n,) [N m or N]
+    excitation: float  # mean reduction of the parameters' prior variance by the motion, 0 to 1
+    #: Whether the parameters' uncertainty adds less than half a noise level to the torque.
     converged: bool
 
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """A step change of the parameters.
+    """A step change of the parameters."""
 
-    Attributes:
-        flagged: Time at which it was flagged, on the clock of the samples [s].
-        onset: Estimated time of the change [s].
-        theta: Base parameters before it, shape (b,).
-        covariance: Their covariance, shape (b, b).
-    """
-
-    flagged: float
-    onset: float
-    theta: Array
-    covariance: Array
+    flagged: float  # time at which it was flagged, on the clock of the samples [s]
+    onset: float  # estimated time of the change [s]
+    theta: Array  # base parameters before it, shape (b,)
+    covariance: Array  # their covariance, shape (b, b)
 
 
 class OnlineIdentifier:
@@ -423,7 +363,9 @@ class OnlineIdentifier:
         self._skipped, self._t, self._now = 0, -np.inf, -np.inf
         self._warmup: list[Instant] = []
         self._kalman: Kalman | None = None
-        self._recent: deque[tuple[float, KalmanState]] = deque(maxlen=_STORED)
+        self._recent: deque[tuple[float, KalmanState]] = deque(
+            maxlen=round(_MEMORY / _STORED_EVERY)
+        )
 
     @overload
     def update(self, t: float, q: Array, tau: Array, /) -> None: ...
@@ -451,13 +393,19 @@ class OnlineIdentifier:
         if not is_number(t):
             raise DataError(f"the sample at t = {str(t)[:60]} s is not finite, so it was refused")
         arrays = [real_numbers(x, name) for name, x in zip(names, (q, *rest), strict=True)]
+        n, shapes = len(self.model.joints), [np.shape(x) for x in arrays]
+        if any(shape != (n,) for shape in shapes):
+            raise DataError(f"{listed(names)} have shapes {listed(shapes)}, wanted ({n},) each")
+        if not (np.isfinite(t) and all(np.isfinite(x).all() for x in arrays)):
+            raise DataError(f"the sample at t = {t:g} s is not finite, so it was refused")
+        if t <= self._now:
+            raise DataError(f"t must increase, but {t:.15g} s follows {self._now:.15g} s")
         if len(rest) == 1:
             for instant in self._signals.push(t, *arrays):
                 self._skipped += 1
                 if self._skipped % self._every == 0:
                     self._take(instant, t)
         else:
-            self._check(t, *arrays)
             if self.delay:  # no filter, and every sample is used
                 self.delay, self._every = 0.0, 1
                 self._pace()
@@ -535,24 +483,12 @@ class OnlineIdentifier:
         # filtered rows are correlated
         self._share = min(1.0, 2.0 * self.settings.cutoff * self._dt)
 
-    def _check(self, t: float, *arrays: Array) -> None:
-        n = len(self.model.joints)
-        if any(np.shape(x) != (n,) for x in arrays):
-            raise DataError(
-                f"q, v, a and tau have shapes {[np.shape(x) for x in arrays]}, wanted ({n},) each"
-            )
-        if not (np.isfinite(t) and all(np.isfinite(x).all() for x in arrays)):
-            raise DataError(f"the sample at t = {t:g} s is not finite, so it was refused")
-        if t <= self._now:
-            raise DataError(f"t must increase, but {t:.15g} s follows {self._now:.15g} s")
-
     def _take(self, instant: Instant, now: float) -> None:
         """Process one instant; store it before the end of the warm-up."""
         if self._kalman is not None:
             self._step(instant, now)
             return
-        v = instant[2]
-        speeds = self.model.layout.drive_speeds[: len(v)]
+        v, speeds = instant[2], self.model.layout.drive_speeds[: len(instant[2])]
         if (np.abs(v) >= self.settings.min_velocity * speeds).any():
             self._warmup.append(instant)
         if len(self._warmup) * self._dt >= self.settings.warmup:
@@ -575,8 +511,8 @@ class OnlineIdentifier:
         self._prior_variance = np.diag(C)
         rms = np.sqrt(np.mean(tau**2, axis=0))
         s = self.settings
-        detector = ChangeDetector(len(joints), s.threshold, _DRIFT)
-        self._innovations = Innovations(rms, self._dt, _MEMORY, s.model_error, detector)
+        detector = ChangeDetector(len(joints), s.threshold)
+        self._innovations = Innovations(rms, self._dt, s.model_error, detector)
         walk = s.walk * np.sqrt(self._dt)
         # noise levels are estimated online, so the weights of the rows include them
         self._kalman = Kalman(np.ones(len(joints)), beta, C, walk, None, self._share)
@@ -593,7 +529,8 @@ class OnlineIdentifier:
         e = tau - Y @ self._state.theta
         uncertainty = np.einsum("ij,ij->i", Y @ self._state.P, Y)  # variance of the prediction
         state = kalman.update(self._state, Sample(Y, tau, used / self._innovations.variance))
-        self._store(t)
+        if not self._recent or t >= self._recent[-1][0] + _STORED_EVERY:
+            self._recent.append((t, self._state))
         self._state, self._t = state, t
         residual = tau - Y @ state.theta
         self._compared = tau, np.where(used, tau - residual, np.nan)
@@ -612,11 +549,6 @@ class OnlineIdentifier:
         self._recent.clear()
         self._innovations.forget_convergence()
 
-    def _store(self, t: float) -> None:
-        """Store the state every tenth of a second."""
-        if not self._recent or t >= self._recent[-1][0] + _STORED_EVERY:
-            self._recent.append((t, self._state))
-
 
 @dataclass(frozen=True, eq=False)
 class Track:
@@ -624,18 +556,17 @@ class Track:
 
     identifier: OnlineIdentifier  # the identifier after the last sample
     t: Array  # times of the newest sample, shape (N,) [s]
-    theta: Array  # base parameters, shape (N, b)
-    std_error: Array  # their standard errors, shape (N, b)
-    excitation: Array  # reduction of the prior variance, shape (N,) [-]
-    converged: Array  # whether the estimate has converged, shape (N,), bool
+    readings: tuple[Reading, ...]  # the estimates then
 
     def columns(self) -> dict[str, Array]:
         """Return the columns of the history, (N,) each: time, base parameters, standard errors."""
         table = {"time": self.t}
         for i, name in enumerate(self.identifier.names):
-            table[name] = self.theta[:, i]
-            table[f"{name}.std_error"] = self.std_error[:, i]
-        return table | {"excitation": self.excitation, "converged": self.converged.astype(float)}
+            table[name] = np.array([x.theta[i] for x in self.readings])
+            table[f"{name}.std_error"] = np.array([x.std_error[i] for x in self.readings])
+        for key in ("excitation", "converged"):
+            table[key] = np.array([float(getattr(x, key)) for x in self.readings])
+        return table
 
 
 def track(
@@ -658,6 +589,4 @@ def track(
             f"{log.path or 'log'}: the robot moves for less than the warm-up of "
             f"{settings.warmup:g} s, so there is no estimate. Use a longer log with motion"
         )
-    keys = ("theta", "std_error", "excitation", "converged")
-    history = {key: np.array([getattr(reading, key) for reading in readings]) for key in keys}
-    return Track(identifier, np.array(times), **history)
+    return Track(identifier, np.array(times), tuple(readings))

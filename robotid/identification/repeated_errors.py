@@ -31,7 +31,7 @@ import scipy.linalg
 from scipy.optimize import minimize_scalar
 
 from robotid.base.typing import Array
-from robotid.data.base_motion import ImuFrame, in_base
+from robotid.data.base_motion import in_base
 from robotid.data.log import Trajectory
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.constraint_rows import constraint_forces, contact_links, without_forces
@@ -39,7 +39,7 @@ from robotid.dynamics.factors import Triangle, join, triangle_of
 from robotid.dynamics.prediction import predict
 from robotid.dynamics.prepared_logs import base_problem
 from robotid.estimation.estimators import WLS
-from robotid.estimation.fitting.recorded import Recordings, RepeatedErrors, Rows, SurveyedLog
+from robotid.estimation.fitting.recorded import Recordings, RepeatedErrors, Rows
 from robotid.robot.constraints import Contact
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
@@ -57,9 +57,9 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
     accelerometers is subtracted. Errors of the motion count without torques of joints.
     """
     model, mapping = recordings.model, recordings.mapping
-    points = [k for k, x in enumerate(model.contacts) if x.kind == "point"]
-    points = [k for k in points if model.contacts[k].uncertainty != 0.0]
-    frames = [_frame(log) for log in recordings.fitted]
+    points = [k for k, x in enumerate(model.contacts) if x.kind == "point" and x.uncertainty != 0.0]
+    bases = [log.head.base for log in recordings.fitted]
+    frames = [None if base is None or base.imu is None else base.imu.frame for base in bases]
     biases = [x.offset if x.offset is not None else np.zeros(3) for x in frames if x is not None]
     is_blind = model.free_flyer and not any(log.head.has_torque for log in recordings.fitted)
     if not (points or biases or is_blind):
@@ -118,18 +118,11 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
 
 def _without_bias(recordings: Recordings, errors: RepeatedErrors, bias: Array) -> Recordings:
     """Return recordings with their errors, without the bias (3,) of accelerometers [m/s^2]."""
-    return replace(
-        recordings,
-        repeated=errors,
-        fitted=[log.with_accelerometer_bias(bias) for log in recordings.fitted],
-        validation=[log.with_accelerometer_bias(bias) for log in recordings.validation],
+    fitted, validation = (
+        [log.with_accelerometer_bias(bias) for log in logs]
+        for logs in (recordings.fitted, recordings.validation)
     )
-
-
-def _frame(log: SurveyedLog) -> ImuFrame | None:
-    """Return the place of the IMU of a log, None without one."""
-    base = log.head.base
-    return None if base is None or base.imu is None else base.imu.frame
+    return replace(recordings, repeated=errors, fitted=fitted, validation=validation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,15 +138,13 @@ class EstimatedErrors:
 def _roots(fit: EstimatedErrors, sizes: Array, c: int) -> Array:
     """Return a root of the covariance of all errors, (d, d).
 
-    Offsets of unknown size have the mean square along each axis of their links, pooled over the
-    points.
+    Offsets of unknown size have the mean square along each axis of their links, pooled over points.
     """
-    # sizes (d,) [m or m/s^2]
     roots, is_open = np.diag(sizes), np.isnan(sizes)
     if is_open.any():
-        own = fit.squares.reshape(is_open.sum() // 3, 3, -1, 3)  # of each pair of points
-        V = np.einsum("ijik->jk", own) / len(own)
-        roots[np.ix_(is_open, is_open)] = np.kron(np.eye(len(own)), np.linalg.cholesky(V))
+        squares = fit.squares.reshape(is_open.sum() // 3, 3, -1, 3)  # of each pair of points
+        V = np.einsum("ijik->jk", squares) / len(squares)
+        roots[np.ix_(is_open, is_open)] = np.kron(np.eye(len(squares)), np.linalg.cholesky(V))
     roots[c:, c:] = np.linalg.cholesky(fit.covariance[c:, c:])
     return roots
 
@@ -168,7 +159,7 @@ def estimated_errors(
     and errors of known size has the singular values z and the torque u along their directions:
     -2 log(evidence) is the sum of log(1 + s^2 z^2) + u^2 / (1 + s^2 z^2).
     """
-    # R (b + d + 1, b + d + 1), L (b, b), mean (b,), sizes (d,), before (d,)
+    # R (b + d + 1, b + d + 1), L (b, b), prior mean of errors of known size before (d,)
     b, is_open = len(mean), np.isnan(sizes)
     some = np.flatnonzero(sizes > 0.0)
     k = b + len(some)
@@ -215,7 +206,6 @@ def _largest(z2: Array, u2: Array) -> float:
 
 def _slopes(model: RobotModel, rows: Rows, pi: Array, points: Sequence[int]) -> Array:
     """Return D, the rows' torque per offset of a contact, shape (N n_rows, 3 len(points)) [N]."""
-    # pi (p,)
     motion = rows.trajectory
     (torque,) = predict(model, [pi], replace(motion, basis=None))
     f = constraint_forces(model, motion, torque, rows.mask)
@@ -224,10 +214,10 @@ def _slopes(model: RobotModel, rows: Rows, pi: Array, points: Sequence[int]) -> 
     first = [k for k, x in zip(edges, model.constraints, strict=False) if isinstance(x, Contact)]
     D = np.zeros((*torque.shape, 3 * len(points)))
     for i, k in enumerate(points):
-        own = f[:, None, first[k] : first[k] + 3]
+        force = f[:, None, first[k] : first[k] + 3]
         if model.contacts[k].axes == "link":
-            own = own @ rotation[:, k].swapaxes(1, 2)  # with the axes of the world
-        moments = np.cross(rotation[:, k].swapaxes(1, 2), own)  # (N, 3, 3), one per axis
+            force = force @ rotation[:, k].swapaxes(1, 2)  # with the axes of the world
+        moments = np.cross(rotation[:, k].swapaxes(1, 2), force)  # (N, 3, 3), one per axis
         D[:, :, 3 * i : 3 * i + 3] = turning[:, k].swapaxes(1, 2) @ moments.swapaxes(1, 2)
     if motion.basis is not None:
         D = without_forces(motion.basis, D)
@@ -236,7 +226,6 @@ def _slopes(model: RobotModel, rows: Rows, pi: Array, points: Sequence[int]) -> 
 
 def _slopes_of_bias(model: RobotModel, rows: Rows, pi: Array) -> Array:
     """Return the rows' torque per acceleration of the base, shape (N n_rows, 3) [N s^2/m]."""
-    # pi (p,)
     motion = replace(rows.trajectory, basis=None)
     (torque,) = predict(model, [pi], motion)
     pushed = [replace(motion, a=motion.a + np.eye(1, model.n_rows, k)) for k in range(3)]
@@ -249,11 +238,9 @@ def _slopes_of_bias(model: RobotModel, rows: Rows, pi: Array) -> Array:
 def _shift(recordings: Recordings, theta: Array, step: int) -> Array:
     """Return the sum of ``_shift_of_motion`` over all logs, of every step-th row, shape (b, 1)."""
     shift = np.zeros((len(theta), 1))
-    for log in recordings.fitted:
-        for rows in (piece.read() for piece in log.pieces):
-            own = replace(rows, trajectory=rows.trajectory.every(step), mask=rows.mask[::step])
-            found = _shift_of_motion(recordings.model, recordings.mapping, own, theta)
-            shift[:, 0] += step * found
+    for rows in (piece.read() for log in recordings.fitted for piece in log.pieces):
+        rows = replace(rows, trajectory=rows.trajectory.every(step), mask=rows.mask[::step])
+        shift[:, 0] += step * _shift_of_motion(recordings.model, recordings.mapping, rows, theta)
     return shift
 
 
@@ -262,13 +249,12 @@ def _shift_of_motion(model: RobotModel, mapping: BaseMapping, rows: Rows, theta:
 
     The errors of the acceleration of the base are those that cause the residual, sample by sample.
     """
-    # theta (b,)
     motion, shift = rows.trajectory, np.zeros(len(theta))
     pushed = [replace(motion, a=motion.a + np.eye(1, model.n_rows, k)) for k in range(6)]
     problems = [base_problem(model, mapping, x, rows.mask).blocks() for x in (motion, *pushed)]
     for (W, tau, weight), *others in zip(*problems, strict=True):
         root = np.sqrt(weight)[:, None]
-        G = np.stack([root * (own - W) for own, *_ in others], axis=1)  # (m, 6, b) per m/s^2
+        G = np.stack([root * (other - W) for other, *_ in others], axis=1)  # (m, 6, b) per m/s^2
         G = G.reshape(-1, model.n_rows, *G.shape[1:])
         residual = (root[:, 0] * (tau - W @ theta)).reshape(-1, model.n_rows)
         A = G @ theta  # (n, n_rows, 6), inertia of the whole robot
@@ -280,7 +266,6 @@ def _shift_of_motion(model: RobotModel, mapping: BaseMapping, rows: Rows, theta:
 
 def _world_acceleration(motion: Trajectory, bias: Array) -> Array:
     """Return the acceleration of the base with the axes of the world, shape (N, 3) [m/s^2]."""
-    # bias (3,) [m/s^2]
     v, back = motion.v, motion.q[:, 3:7] * np.array([-1.0, -1.0, -1.0, 1.0])
     return in_base(back, motion.a[:, :3] + np.cross(v[:, 3:6], v[:, :3]) + bias)
 
@@ -292,7 +277,6 @@ def mean_drift(a: Array, segment: Array) -> float:
     that of w'' x: constant speeds have no effect, and those at the ends have none. The plain mean
     is their change over T, 0.05 m/s^2 for a robot that sways.
     """
-    # a (N, 3) [m/s^2], segment (N,)
     counts = np.unique(segment, return_counts=True)[1]
     w = np.concatenate([np.hanning(count + 2)[1:-1] for count in counts])
     return float(np.linalg.norm(w @ a / w.sum()) / np.sqrt(3.0))

@@ -143,24 +143,15 @@ class Identification(Identified):
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class TorqueIdentification(Identification, Fit):
-    """Identification that predicts torques.
-
-    Attributes:
-        warnings: Why it may be wrong although it predicts well, from the doctor and the fit.
-        misfits: Terms that its drive models lack.
-        on_misfit: Names of drive parameters whose errors increased for these.
-        scale: Scale check without payloads, as it was computed; None: not yet.
-        payload_checks: Checks of the torque scale with payloads of known mass, that with the
-            narrowest interval first.
-    """
+    """Identification that predicts torques."""
 
     fitted: tuple[Evaluation, ...]
     validation: tuple[Evaluation, ...]
-    warnings: tuple[VerdictWarning, ...] = ()
-    misfits: tuple[Misfit, ...] = ()
-    on_misfit: tuple[str, ...] = ()
-    scale: ScaleCheck | None = None
-    payload_checks: tuple[PayloadCheck, ...] = ()
+    warnings: tuple[VerdictWarning, ...] = ()  # why it may be wrong although it predicts well
+    misfits: tuple[Misfit, ...] = ()  # terms that its drive models lack
+    on_misfit: tuple[str, ...] = ()  # names of drive parameters whose errors increased for these
+    scale: ScaleCheck | None = None  # scale check without payloads, as computed; None: not yet
+    payload_checks: tuple[PayloadCheck, ...] = ()  # that with the narrowest interval first
 
     metrics = Fit.metrics
 
@@ -169,10 +160,6 @@ class TorqueIdentification(Identification, Fit):
 
     def _friction_lines(self) -> list[str]:
         return friction_lines({drive.joint: drive.to_dict() for drive in self.drives})
-
-    def _cause_of(self, joint: str) -> tuple[str, str]:
-        """Return the cause of a joint's residual, and what to do."""
-        return self.joint_torques[self.model.row_names.index(joint)].cause
 
     @cached_property
     def joint_torques(self) -> tuple[JointTorque, ...]:
@@ -190,38 +177,30 @@ class TorqueIdentification(Identification, Fit):
         scale = check_scale(self) if self.scale is None else self.scale
         return replace(scale, payloads=self.payload_checks)
 
-    @property
-    def _uncertain_drives(self) -> list[str]:
-        """The drive parameters that the prior determines, without those of undetermined sums."""
-        drives = list(zip(self.model.layout.names, self.sources, strict=True))
-        drives = drives[self.model.layout.n_inertial :]
-        return [n for n, source in drives if source == "prior" and n not in self.undetermined]
-
     @cached_property
     def verdict(self) -> Verdict:
         """Verdict on the result, with reasons."""
-        logs = [e.recording.log for e in (*self.fitted, *self.validation)]
-        driven = tuple(x for x in self.model.joints if x not in self.model.passive)
+        model, recordings = self.model, [e.recording for e in (*self.fitted, *self.validation)]
+        driven = tuple(x for x in model.joints if x not in model.passive)
         predictions = Predictions(
             self.metrics(),
             self.predictions,
-            driven if any(log.has_torque for log in logs) else (),
+            driven if any(recording.log.has_torque for recording in recordings) else (),
             refitted=[e.name for e in self.refitted],
-            hidden=hidden_joints(self.model, self.fitted),
+            hidden=hidden_joints(model, self.fitted),
         )
+        sources = list(zip(model.layout.names, self.sources, strict=True))
+        by_prior = [name for name, x in sources[model.layout.n_inertial :] if x == "prior"]
         determined = Determined(
             self.determination.undetermined,
             self.is_consistent,
             self.is_poorly_excited,
-            self.model.is_static,
-            self._uncertain_drives,
+            model.is_static,
+            [name for name in by_prior if name not in self.undetermined],
         )
         # not of long logs, of which only parts are in memory, and not of projected rows, whose
         # torques are not those of joints
-        has_cause = not (
-            self.model.constraints
-            or any(e.recording.is_partial for e in (*self.fitted, *self.validation))
-        )
+        has_cause = not (model.constraints or any(x.is_partial for x in recordings))
         return judge(
             predictions,
             determined,
@@ -230,3 +209,7 @@ class TorqueIdentification(Identification, Fit):
             scale_check=self.scale_check,
             cause_of=self._cause_of if has_cause else None,
         )
+
+    def _cause_of(self, joint: str) -> tuple[str, str]:
+        """Return the cause of a joint's residual, and what to do."""
+        return self.joint_torques[self.model.row_names.index(joint)].cause

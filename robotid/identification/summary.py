@@ -32,17 +32,19 @@ def error_lines(
     }
     keys = [f"{name}_relative_error_pct" for name in _BESIDE]
     shown = [key for key in keys if any(m.get(key) is not None for m in joints.values())]
-    rows, is_worse = [], False
+    rows = []
     for joint, m in joints.items():
-        mark = "" if m["better_than_constant"] else " *"
-        is_worse = is_worse or bool(mark)
         rmse = f"{m['rmse']:#.3g}".rstrip(".")
         error, *plain = (cell(m.get(key)) for key in ("relative_error_pct", *shown))
-        rows.append([joint + mark, error, rmse, m["unit"], *plain])
+        rows.append([joint + _mark(m), error, rmse, m["unit"], *plain])
     named = dict(zip(keys, _BESIDE.values(), strict=True))
     heads = ["joint\n", "error\n%", "rmse\n", "\n", *(named[key] for key in shown)]
     lines = columns(heads, rows, width=width, needed=4, left=(0, 3))
-    return lines + (["  * worse than a constant"] if is_worse else [])
+    return lines + (["  * worse than a constant"] if any(map(_mark, joints.values())) else [])
+
+
+def _mark(metrics: Mapping[str, Any]) -> str:
+    return "" if metrics["better_than_constant"] else " *"
 
 
 def friction_lines(friction: Mapping[str, Any]) -> list[str]:
@@ -50,14 +52,9 @@ def friction_lines(friction: Mapping[str, Any]) -> list[str]:
     lines = []
     for joint, choice in friction.items():
         if choice["families"]:
-            before, after = (
-                step["held_out_error_pct"]
-                for step in (
-                    choice["tried"][0],
-                    [s for s in choice["tried"] if s["is_selected"]][-1],
-                )
-            )
-            gain = f"held-out error {before:.1f} -> {after:.1f} %"
+            selected = [step for step in choice["tried"] if step["is_selected"]]
+            ends = (step["held_out_error_pct"] for step in (choice["tried"][0], selected[-1]))
+            gain = "held-out error {:.1f} -> {:.1f} %".format(*ends)
             lines.append(f"  {joint}: {' + '.join(choice['families'])} ({gain})")
     return ["friction besides viscous and Coulomb:", *lines] if lines else []
 
@@ -65,10 +62,10 @@ def friction_lines(friction: Mapping[str, Any]) -> list[str]:
 def left_out_lines(logs: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the errors by joint of logs that a fit to the others predicts, as text."""
     errors: dict[str, list[float]] = {}
-    for each in logs:
-        for joint, own in each["per_joint"].items():
-            if own["relative_error_pct"] is not None:
-                errors.setdefault(joint, []).append(own["relative_error_pct"])
+    for log in logs:
+        for joint, metrics in log["per_joint"].items():
+            if metrics["relative_error_pct"] is not None:
+                errors.setdefault(joint, []).append(metrics["relative_error_pct"])
     if not errors:
         return []
     words = [f"{joint} {min(x):.1f} to {max(x):.1f} %" for joint, x in errors.items()]

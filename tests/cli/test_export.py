@@ -74,12 +74,3 @@ def test_neither_inputs_nor_files_of_a_user_are_replaced(result, tmp_path, capsy
         target = tmp_path / f"again.{kind}"
         assert [export(result, kind, target, capsys)[0] for _ in range(2)] == [0, 0]
     assert [path.read_bytes() for path in files] == before
-
-
-def test_a_place_that_cannot_be_written_is_named(result, tmp_path, capsys):
-    code, _, err = export(result, "mjcf", tmp_path / "none" / "a.xml", capsys)
-    assert code == 1
-    assert "does not exist; create it" in err
-    code, _, err = export(result, "sdf", tmp_path, capsys)
-    assert code == 2
-    assert "is a folder, wanted a file to write" in err

@@ -9,7 +9,7 @@ from helpers.mujoco_plant import plant, torque_log
 import robotid
 from robotid.cli.identify import run_job
 from robotid.cli.job import read_job
-from robotid.identification.closed_loop.loop_result import PositionIdentification
+from robotid.identification.closed_loop.from_commands import PositionIdentification
 
 SETTINGS = {"bodies": 0.0, "step": 4e-3, "torques": False}
 

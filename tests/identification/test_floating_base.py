@@ -181,6 +181,9 @@ def test_a_bias_of_the_accelerometers_is_estimated(go1, trot):
     np.testing.assert_allclose([float(x) for x in found.split(", ")], bias, atol=0.015)
     assert 0.001 < sure < 0.01
     held = hold_log(go1, biased, SIGNALS)
-    once = with_repeated_errors(Recordings(go1, structural_mapping(go1), [held]))
+    mapping, plain = structural_mapping(go1), replace(biased, base=BaseMotion(biased.base.pose))
+    once = with_repeated_errors(Recordings(go1, mapping, [held]))
+    both = Recordings(go1, mapping, [held, hold_log(go1, plain, SIGNALS)])  # one without an IMU
+    np.testing.assert_allclose(with_repeated_errors(both).repeated.bias, bias, atol=0.015)
     again = with_repeated_errors(once).repeated  # of what is left: the whole bias is the same
     np.testing.assert_allclose(again.bias, once.repeated.bias, atol=0.4 * sure)

@@ -51,17 +51,16 @@ def _reasons(content):
     return [x for own in (verdict, *verdict["per_joint"].values()) for x in own["reasons"]]
 
 
-def compare(job, folder, *, held=HELD, rtol=1e-9, fit_rtol=1e-5):
+def compare(job, folder):
     """Run a job in memory and in pieces; check all that result.json says. Return both.
 
     What the conic solver of "consistent" makes of equal factors differs within its tolerance.
     """
-    in_memory = run_job(replace(job, rows_in_memory=10**9), folder / "memory")
-    in_pieces = run_job(replace(job, rows_in_memory=held), folder / "pieces")
-    (one, first), (other, second) = in_memory, in_pieces
+    one, first = run_job(replace(job, rows_in_memory=10**9), folder / "memory")
+    other, second = run_job(replace(job, rows_in_memory=HELD), folder / "pieces")
     wls = one.wls.theta
-    np.testing.assert_allclose(other.wls.theta, wls, rtol=0, atol=rtol * np.abs(wls).max())
-    np.testing.assert_allclose(other.prior_std, one.prior_std, rtol=rtol)
+    np.testing.assert_allclose(other.wls.theta, wls, rtol=0, atol=1e-9 * np.abs(wls).max())
+    np.testing.assert_allclose(other.prior_std, one.prior_std, rtol=1e-9)
     check_errors(one, other)
     gap = np.abs(other.standard - one.standard) / one.standard_error
     assert gap.max() < 1e-3, "standard errors"
@@ -72,7 +71,7 @@ def compare(job, folder, *, held=HELD, rtol=1e-9, fit_rtol=1e-5):
         assert_close(second[key], first[key], 1e-6)
     assert_close(second["inputs"], first["inputs"], 1e-14)
     for key in ("identification", "validation"):
-        assert_close(without_bands(second[key]), without_bands(first[key]), fit_rtol)
+        assert_close(without_bands(second[key]), without_bands(first[key]), 1e-5)
         assert_close(second["wls"][key], first["wls"][key], 1e-8)
     assert {w["code"] for w in second["warnings"]} == {w["code"] for w in first["warnings"]}
     return one, other

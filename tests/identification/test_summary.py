@@ -1,7 +1,5 @@
 """What a notebook and print() show of a result."""
 
-import numpy as np
-import pytest
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
@@ -10,28 +8,10 @@ from robotid.identification.summary import error_lines, friction_lines, verdict_
 from robotid.robot.model import RobotModel
 
 
-@pytest.fixture(scope="module")
-def arm():
-    return RobotModel.from_urdf(ROOT / "urdf" / "planar_2r.urdf")
-
-
-@pytest.fixture(scope="module")
-def logs(arm):
-    rng = np.random.default_rng(0)
-    return [exact_log(arm, truth(arm), rng, samples=800, noise=0.1) for _ in range(2)]
-
-
-@pytest.fixture(scope="module")
-def reported():
-    return []
-
-
-@pytest.fixture(scope="module")
-def found(arm, logs, reported):
-    return identify(arm, logs[:1], validation=logs[1:], progress=lambda *x: reported.append(x))
-
-
-def test_its_text_has_verdict_reasons_and_every_joint(found):
+def test_its_text_has_verdict_reasons_and_every_joint(rng):
+    arm = RobotModel.from_urdf(ROOT / "urdf" / "planar_2r.urdf")
+    log, kept = (exact_log(arm, truth(arm), rng, samples=800, noise=0.1) for _ in range(2))
+    found = identify(arm, [log], validation=[kept])
     text = str(found)
     assert text == found.summary()
     assert text.splitlines()[0].endswith(f"verdict {found.verdict.status}")

@@ -91,14 +91,10 @@ class _Bag:
 def _open(path: Path, source: LogSource) -> Table:
     """Return the table of a .mcap, .db3 or .bag file, or of the folder of a ROS 2 bag.
 
-    The columns are ``time`` [s] since the epoch, ``position_<joint>``, ``velocity_<joint>`` and
-    ``effort_<joint>``. The order of the joints may differ between messages. Messages without any
-    of the required columns, as those of another publisher, are ignored; an inconsistent message,
-    or one with only some of the required columns, is a ``DataError``.
-
-    A controller's state has commands, too (``_controlled``). For joint states, these are in a
-    second topic; a zero-order hold brings them to the time stamps of the states. A LowState of
-    Unitree contains its motors, by number: ``position_0``.
+    Columns are ``time`` [s] since the epoch, ``position_<joint>``, ``velocity_<joint>`` and
+    ``effort_<joint>``; of Unitree's LowState by the number of the motor. Messages without any
+    required column are ignored; one with only some of them is a ``DataError``. Commands are those
+    of a controller's state (``_controlled``), or of a second topic, by a zero-order hold.
     """
     with _opened(path, source) as bag:
         sensors = _sensors_of(bag)

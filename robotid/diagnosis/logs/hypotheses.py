@@ -297,7 +297,8 @@ def _shares_by_gravity(probe: Probe) -> tuple[Callable[[Array], Array], Array]:
     """
     links, size = probe.loads(), _variation(probe.tau)
     X = [links, *probe.gravity_loads, probe.drives, probe.tau[:, :, None]]
-    R = _triangles(np.concatenate(X, axis=2).swapaxes(0, 1))
+    rows = np.concatenate(X, axis=2).swapaxes(0, 1)
+    R = np.asarray(np.linalg.qr(rows, mode="r"))  # (n, c, c)
     bodies = links.shape[2]
     parts = R[:, :, : 4 * bodies].reshape(*R.shape[:2], 4, bodies)
 
@@ -432,11 +433,7 @@ def _misfits(X: Array, torques: Array) -> Array:
     size = np.linalg.norm(X, axis=1, keepdims=True)
     used = size > 1e-9 * size.max(axis=2, keepdims=True, initial=1e-300)
     unit = np.divide(X, size, out=np.zeros_like(X), where=used)
-    R, c = _triangles(np.concatenate([unit, torques], axis=2)), X.shape[2]
+    rows, c = np.concatenate([unit, torques], axis=2), X.shape[2]
+    R = np.asarray(np.linalg.qr(rows, mode="r"))
     left = [[nnls(R_j[:, :c], tau)[1] for tau in R_j[:, c:].T] for R_j in R]
     return np.square(left)
-
-
-def _triangles(rows: Array) -> Array:
-    """Return the triangular factors of the rows of each joint, (n, N, c), shape (n, c, c)."""
-    return np.asarray(np.linalg.qr(rows, mode="r"))

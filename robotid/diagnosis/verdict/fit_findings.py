@@ -234,7 +234,10 @@ def consistency_findings(fit: Fit) -> Iterator[Finding]:
     bounds = [name for name in active if name.startswith(_USER_BOUNDS)]
     if bounds:
         why, words = _contradiction(fit)
-        is_warning = why != "harmless" and bool(_stated(fit).intersection(bounds))
+        own = fit.estimator.bounds  # those of the links' geometry are often active
+        stated = {"total_mass all", *(f"mass {link}" for link in own.mass)}
+        stated |= {f"centre_of_mass {link}" for link in own.com}
+        is_warning = why != "harmless" and not stated.isdisjoint(bounds)
         yield finding(
             "active_bound", subject=", ".join(bounds), bounds=listed(bounds), why=why,
             severity="warning" if is_warning else "note", **words,
@@ -418,16 +421,6 @@ def _contradiction(fit: Fit) -> tuple[str, dict[str, str]]:
         if mass < _VANISHED * before
     ]
     return ("vanished", {"vanished": ", ".join(vanished)}) if vanished else ("harmless", {})
-
-
-def _stated(fit: Fit) -> set[str]:
-    """Return the bounds that the user states; those of the links' geometry are often active."""
-    stated = fit.estimator.bounds
-    return {
-        "total_mass all",
-        *(f"mass {link}" for link in stated.mass),
-        *(f"centre_of_mass {link}" for link in stated.com),
-    }
 
 
 def unlike_findings(variation: Variation | None) -> Iterator[Finding]:

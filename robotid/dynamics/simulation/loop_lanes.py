@@ -569,8 +569,7 @@ def coded_term(term: DriveTerm) -> tuple[tuple[int, ...], tuple[float, ...]]:
     """Return a term for ``term`` and ``deflection``: five codes and eleven numbers.
 
     The codes are the addresses of its laws of speed and position (0 without one), its kind, and the
-    number of shape parameters of each law. The numbers are four shape parameters of each law, and
-    the ranges.
+    counts of their shape parameters; the numbers four of these for each law, and the ranges.
     """
     if isinstance(term, Bristles):
         return (0, 0, BRISTLES, 0, 0), (*term.numbers, *[0.0] * 8)
@@ -749,9 +748,7 @@ def average_command(stamps, values, times, delay, mean, change):
 def divide_rows(stamps, ticks, times, is_tick):
     """Write the ends of the steps: an equal number in each row, and none across a tick.
 
-    Ticks divide a row. The longest steps are divided further, into two, three and so on, until the
-    row has the required number.
-    stamps (N,) [s], is_tick ((N - 1) every,).
+    Ticks divide a row; the longest steps are divided further until the row has the number.
     """
     every, i = len(is_tick) // (len(stamps) - 1), 0
     edges, shares = np.empty(every + 1), np.empty(every, np.int64)

@@ -50,11 +50,9 @@ class FourierTrajectory(Motion):
 
 @dataclass(frozen=True)
 class ProgramMotion(Motion):
-    """The motion q(t) = q0 + A (a1 t^5 + a2 t^4 + a3 t^3), from rest to rest.
+    """The motion q(t) = q0 + A (6 s^5 - 15 s^4 + 10 s^3), s = t / T (Tzvetkova, (28)).
 
-    With a1 = 6 / T^5, a2 = -15 / T^4, a3 = 10 / T^3 the motion is from q0 to q0 + A, with zero
-    velocity and acceleration at both ends. Before 0 and after T the robot is at rest. See
-    Tzvetkova, (28).
+    Velocity and acceleration are zero at both ends; before 0 and after T the robot is at rest.
     """
 
     amplitude: Array  # A, displacement of each joint, (n,), or (R, n) for R motions [rad or m]

@@ -96,13 +96,11 @@ def follow(
     settings: Simulation,
     progress: ProgressCallback = ignore_progress,
 ) -> Run:
-    """Return the exact motion of a robot that tracks a motion.
+    """Return the exact motion of a robot, a ``RobotPlant``, that tracks a motion.
 
-    The plant is ``RobotPlant`` with the parameters pi. An elastic gear has the motor angle th and
-    the torque tau = k dead(th - q) + d (w - v); rotor and friction are then on the motor's side.
-    The integrator is a Rosenbrock W-method of order 3, which is stable with stiction. See Rang,
-    Angermann (2005), New Rosenbrock W-methods of order 3 for partial differential algebraic
-    equations of index 1.
+    An elastic gear has the motor angle th and the torque tau = k dead(th - q) + d (w - v); rotor
+    and friction are then on the motor's side. The integrator is a Rosenbrock W-method of order 3,
+    which is stable with stiction (Rang, Angermann 2005, New Rosenbrock W-methods).
     """
     _check_size(duration * rate, 1)
     t = np.arange(round(duration * rate) + 1) / rate

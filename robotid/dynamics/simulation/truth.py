@@ -43,11 +43,9 @@ def perturbed_bodies(model: RobotModel, size: float, rng: np.random.Generator) -
     """Return inertial parameters of bodies near the model's, shape (10 bodies,).
 
     For each body J' = J^1/2 exp(S) J^1/2. S is symmetric and normal, with ten independent
-    coordinates of equal standard deviation in the metric d^2 = 1/2 tr(log(J^-1 J')^2). The
-    distribution does not depend on frame, units or body, and J' is positive definite if J is. See
-    Wensing, Kim, Slotine (2018), Linear Matrix Inequalities for Physically Consistent Inertial
-    Parameter Identification; Lee, Park (2018), A Geometric Algorithm for Robust Multibody Inertial
-    Parameter Identification, (13).
+    coordinates of equal standard deviation in the metric d^2 = 1/2 tr(log(J^-1 J')^2) (Wensing,
+    Kim, Slotine 2018; Lee, Park 2018, (13)). J' is positive definite if J is, whatever the frame,
+    units or body.
     """
     bodies = model.standard_parameters()[: model.layout.n_inertial]
     if size == 0.0:

@@ -1,32 +1,47 @@
-"""identify_loops(): closed-loop identification of drives, loops and bodies from command logs."""
+"""identify_loops(): closed-loop identification from command logs, its result and its findings."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from robotid.base.exceptions import DataError
+from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import Finding, by_severity, listed, quoted
-from robotid.base.typing import ProgressCallback, ignore_progress, report_stage
-from robotid.data.log import Log
+from robotid.base.typing import Array, ProgressCallback, ignore_progress, report_stage
+from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import unwrap
 from robotid.diagnosis.catalogue import entries, finding
 from robotid.diagnosis.verdict.fit_findings import not_written, unlike_findings
-from robotid.diagnosis.verdict.verdict import blocking
+from robotid.diagnosis.verdict.parameter_table import correlated_sets
+from robotid.diagnosis.verdict.verdict import Verdict, blocking, judge_positions
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.friction_projection import DriveMoments, drive_moments
 from robotid.dynamics.prediction import predict_instants
 from robotid.dynamics.simulation.loops import Loops, open_loops
+from robotid.estimation.estimators.estimator import Estimate
+from robotid.estimation.estimators.output_error import segment_scores
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
+from robotid.estimation.fitting.evaluation import Metrics
+from robotid.estimation.fitting.fitted import FROM_PRIOR, sources_of
+from robotid.estimation.fitting.standard_errors import QUANTILE
+from robotid.estimation.variation.groups import FEWEST_RUNS, Group, RunsOf, inflation_of
+from robotid.estimation.variation.spread import Runs
 from robotid.estimation.variation.variation import vary
-from robotid.identification.closed_loop.encoder_zeros import CLEAR, parallel_axes
-from robotid.identification.closed_loop.loop_result import (
-    PositionIdentification,
-    identified_loops,
-    loop_runs,
-)
+from robotid.identification.closed_loop.initial_values import CLEAR, parallel_axes
 from robotid.identification.closed_loop.loop_settings import LoopSettings
-from robotid.identification.closed_loop.position_errors import run_open_loop
+from robotid.identification.closed_loop.loop_simulator import (
+    FreeParameter,
+    LoopSimulator,
+    with_terms,
+)
+from robotid.identification.closed_loop.position_errors import (
+    PositionEvaluation,
+    pool_positions,
+    run_open_loop,
+)
 from robotid.identification.closed_loop.stages import (
     CHANGE,
     STAGES,
@@ -34,8 +49,145 @@ from robotid.identification.closed_loop.stages import (
     fit_loops,
     stated_loops,
 )
-from robotid.identification.result import StatedSettings
+from robotid.identification.result import Identification, StatedSettings
+from robotid.robot.drives import TERMS, Spring
 from robotid.robot.model import RobotModel
+from robotid.robot.parameters import pseudo_inertia
+
+_CHANGE = 0.1  # plausible standard deviation of a parameter between logs, over its value
+_LEAST = 0.01  # ... at least, over its prior standard deviation
+_CAUTIONS = ("at_bound", "coarse_steps", "gains_contradicted")  # with these no result is good
+_GAP = 3.0  # step in time above which no speed is computed [median steps]
+_MOVING = 0.05  # smallest speed above the noise, relative to the largest speed of a joint
+_MISMATCH = 0.5  # largest relative error of a torque that the loop of its joint gives
+_KNOWN = 0.1  # standard error of a known delay, relative to the range found from one response
+_POSITIVE = ("kp", "limit")  # parameters whose lower bound is more than 0
+_UNEQUAL = 3.0  # ratio of the gains of equal drives from which on they are reported
+_NAMED = 8  # largest number of parameters that a sentence names
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class PositionIdentification(Identification):
+    """Identification that predicts positions, by simulation from commands or torques."""
+
+    loop: LoopSettings  # what is known of the loops
+    estimator: SimulationSettings
+    fit: Fitted
+    fitted: tuple[PositionEvaluation, ...]  # logs with their simulated positions
+    validation: tuple[PositionEvaluation, ...]
+
+    @property
+    def estimate(self) -> Estimate:
+        """The estimate of the free parameters of loops, drives and bodies."""
+        return self.fit.estimate
+
+    @cached_property
+    def _slopes(self) -> Array:
+        """Derivatives of the standard parameters by the free ones, shape (p, c)."""
+        return self.fit.simulator.standard(self.model, self.estimate.theta)[1]
+
+    @property
+    def standard_error(self) -> Array:
+        """Standard errors of the standard parameters, shape (p,); inf of those not fitted."""
+        return _errors(self.standard_covariance)
+
+    @cached_property
+    def standard_quantile(self) -> Array:
+        """Half-width of the 95 % interval of each standard parameter [standard errors], (p,).
+
+        Of the free parameters that determine it, the one whose standard error has the fewest
+        degrees of freedom gives the quantile.
+        """
+        return _largest_quantile(self._slopes, self.estimate.quantile)
+
+    @property
+    def base_quantile(self) -> Array:
+        return _largest_quantile(self.mapping.K, self.standard_quantile)
+
+    @property
+    def at_bound(self) -> Array:
+        return np.isin(self.model.layout.names, self.estimate.details["at_bound"])
+
+    @cached_property
+    def shrunk(self) -> Array:
+        """Standard error of each free parameter over its prior spread, shape (c,) [-]."""
+        share: Array = self.estimate.std_error / self.fit.simulator.prior_std
+        return share
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Source of each standard parameter; "mixed" for bodies and shared drive parameters."""
+        own = dict(zip(self.fit.simulator.names, self.shrunk.tolist(), strict=True))
+        share = np.array([own.get(name, np.nan) for name in self.model.layout.names])
+        is_prior = np.isinf(self.standard_error) | ((share > FROM_PRIOR) & ~self.at_bound)
+        return sources_of(share, is_prior, self.at_bound)
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Free parameters that the logs do not determine, without those of bodies."""
+        return tuple(
+            free.name
+            for free, share in zip(self.fit.simulator.free_parameters, self.shrunk, strict=True)
+            if share > FROM_PRIOR and free.what != "body"
+        )
+
+    @property
+    def correlated(self) -> tuple[tuple[str, ...], ...]:
+        """Sets of strongly correlated free parameters of loops and drives."""
+        free, C = self.fit.simulator.free_parameters, self.estimate.covariance
+        drives = [k for k, x in enumerate(free) if x.what != "body" and C[k, k] > 0]
+        return tuple(tuple(free[k].name for k in set_) for set_ in correlated_sets(C, drives))
+
+    @property
+    def moments(self) -> dict[str, DriveMoments]:
+        """Moments that project the friction of drives on simpler terms, from the fitted logs."""
+        model = self.model.with_reference(self.standard)
+        motions = [logged_motion(run.log) for run in self.fitted] if model.layout.own else []
+        moving = [np.abs(m.v) > _MOVING * np.abs(m.v).max(axis=0) for m in motions]
+        return drive_moments(model, zip(motions, moving, strict=True))
+
+    @property
+    def is_consistent(self) -> bool:
+        """Whether every body is physically consistent."""
+        bodies = pseudo_inertia(self.standard[: self.model.layout.n_inertial])
+        return bool((np.linalg.eigvalsh(bodies) >= 0).all())
+
+    @property
+    def has_gains(self) -> bool:
+        """Whether the robot has position controllers: no logged torque drives it."""
+        return self.loop.kind != "torque"
+
+    @property
+    def has_stated_gains(self) -> bool:
+        """Whether the position gain of every joint was stated."""
+        return not any(free.what == "kp" for free in self.fit.simulator.free_parameters)
+
+    @property
+    def is_scaled_by_gain(self) -> bool:
+        """Whether only the stated gains determine the scale: no torque was fitted."""
+        simulator = self.fit.simulator
+        return self.has_gains and self.has_stated_gains and not simulator.knows_torques
+
+    def metrics(self, name: str = "estimate") -> Metrics:
+        """Return the metrics of positions over all fitted logs."""
+        if name != "estimate":
+            raise SettingsError(f"name is {name!r}, wanted 'estimate'")
+        return pool_positions(self.fitted)
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """The verdict on the result."""
+        return judge_positions(
+            pool_positions(self.validation or self.fitted, moving=True),
+            self.model.joints,
+            fitted=pool_positions(self.fitted, moving=True),
+            is_validation=bool(self.validation),
+            is_settled=self.estimate.converged,
+            log_errors=self.log_errors,
+            cautions=[f.message for f in self.findings if f.code in _CAUTIONS],
+            scale=entries()["scale"]["what"]["gains"] if self.is_scaled_by_gain else "",
+            knows_torques=self.loop.kind == "torque" or self.fit.simulator.knows_torques,
+        )
 
 
 def identify_loops(
@@ -77,26 +229,33 @@ def identify_loops(
     report_stage(progress, "testing", STAGES)
     sign, simulator = fitted.encoders.sign, fitted.simulator
     robot = simulator.fine or simulator.robot  # with the steps of the fit
+    others = _others(model, loop, fitted)
     runs = [
-        [
-            run_open_loop(
-                robot, fitted.loops, log.turned(sign), _others(model, loop, fitted)
-            )
-            for log in part
-        ]
+        [run_open_loop(robot, fitted.loops, log.turned(sign), others) for log in part]
         for part in (logs, validation)
-    ]  # fmt: skip
-    result = identified_loops(model, loop, settings, fitted, *map(tuple, runs))
+    ]
     errors = blocking(examined, ignore)
-    result = replace(
-        result,
+    of_logs = loop_runs(model, simulator, fitted.estimate, units)
+    extended = with_terms(model, fitted.loops)
+    standard, slopes = simulator.standard(extended, fitted.estimate.theta)
+    covariance = slopes @ fitted.estimate.covariance @ slopes.T
+    mapping = structural_mapping(extended)
+    result = PositionIdentification(
+        model=extended,
+        mapping=mapping,
+        prior=extended.standard_parameters(),
+        standard=standard,
+        standard_covariance=covariance,
+        base=mapping.to_base(standard),
+        base_error=_errors(mapping.K @ covariance @ mapping.K.T),
+        loop=loop,
+        estimator=settings,
+        fit=fitted,
+        fitted=tuple(runs[0]),
+        validation=tuple(runs[1]),
         log_errors=tuple(finding.message for finding in errors),
         stated=StatedSettings(used, ignore=tuple(ignore)),
-        variation=vary(
-            [log.name for log in logs],
-            loop_runs(model, simulator, fitted.estimate, units),
-            sorted(set(units)),
-        ),
+        variation=vary([log.name for log in logs], of_logs, sorted(set(units))),
     )
     examined = [*examined, *unlike_findings(result.variation)]
     return replace(result, findings=(*loop_findings(result, examined), *not_written(errors)))
@@ -126,10 +285,9 @@ def with_gravity(model: RobotModel, log: Log) -> Log:
 
 
 def driven_log(model: RobotModel, log: Log, signals: SignalSettings) -> Log:
-    """Return a log whose feed-forward torque is the measured one.
+    """Return a log whose feed-forward torque is the measured one, and its position the command.
 
-    The feed-forward torque is constant between two rows: the mean of the two, which avoids a delay
-    of half a row. The command is the measured position; its gain is 0.
+    It is constant between two rows: the mean of the two, which avoids a delay of half a row.
     """
     if not log.has_torque:
         raise DataError(
@@ -139,17 +297,84 @@ def driven_log(model: RobotModel, log: Log, signals: SignalSettings) -> Log:
     free = np.array([joint.turns_freely for joint in model.limits])
     log = unwrap(log, free)
     measured = np.column_stack(
-        [np.interp(log.t + signals.torque_delay, log.t, own) for own in log.tau.T]
+        [np.interp(log.t + signals.torque_delay, log.t, tau) for tau in log.tau.T]
     )
     tau = np.vstack([0.5 * (measured[1:] + measured[:-1]), measured[-1:]])
     return replace(log, q_ref=log.q, v_ref=None, tau_ref=tau)
 
 
-_MISMATCH = 0.5  # largest relative error of a torque that the loop of its joint gives
-_KNOWN = 0.1  # standard error of a known delay, relative to the range found from one response
-_POSITIVE = ("kp", "limit")  # parameters whose lower bound is more than 0
-_UNEQUAL = 3.0  # ratio of the gains of equal drives from which on they are reported
-_NAMED = 8  # largest number of parameters that a sentence names
+def loop_runs(
+    model: RobotModel, simulator: LoopSimulator, estimate: Estimate, unit: Sequence[str] = ()
+) -> tuple[RunsOf, ...]:
+    """Return the information of each log about the parameters of each joint, or of shared ones."""
+    logs = list(dict.fromkeys(id(window.log) for window in simulator.windows))
+    if len(logs) < FEWEST_RUNS or simulator.torque is not None:
+        return ()
+    scores = []
+    for log in logs:
+        windows = tuple(window for window in simulator.windows if id(window.log) == log)
+        scores.append(segment_scores(replace(simulator, windows=windows), estimate))
+    _, units = np.unique(unit or [""] * len(logs), return_inverse=True)
+    groups: dict[tuple[int, ...], list[int]] = {}
+    is_prior = estimate.std_error > FROM_PRIOR * simulator.prior_std
+    for k, free in enumerate(simulator.free_parameters):
+        is_open = is_prior[k] or free.name in estimate.details["at_bound"]
+        if free.what != "body" and not is_open:
+            groups.setdefault(free.joints, []).append(k)
+    runs_of = []
+    for places in groups.values():
+        group_scores = [(H[:, places][:, :, places], g[:, places]) for H, g in scores]
+        H, h = (np.array([pair[k].sum(axis=0) for pair in group_scores]) for k in (0, 1))
+        if not H.any():
+            continue
+        members = [simulator.free_parameters[k] for k in places]
+        centre, spread = estimate.theta[places], simulator.prior_std[places]
+        spread = np.where(np.isfinite(spread), spread, 0.0)
+        scale = np.maximum(_CHANGE * np.abs(centre), np.maximum(_LEAST * spread, 1e-12))
+        group = Group(
+            "drive",
+            members[0].name.rpartition(".")[0],
+            tuple(free.name for free in members),
+            tuple(units_of(model, free) for free in members),
+            np.zeros((0, len(members))),
+            members[0].joints,
+        )
+        inflation = inflation_of(group_scores)
+        runs = Runs(H / inflation, h / inflation, units, scale)
+        runs_of.append(RunsOf(group, centre, runs, inflation))
+    return tuple(runs_of)
+
+
+def units_of(model: RobotModel, free: FreeParameter) -> str:
+    """Return the unit of a free parameter of a loop or drive."""
+    is_linear = model.joints[free.joints[0]] in model.layout.prismatic
+    like = {"kp": Spring(), "kd": TERMS["viscous"], "limit": TERMS["coulomb"]}
+    term = free.term or like.get(free.what) or TERMS.get(free.what)
+    if term is not None:
+        return term.units[is_linear]
+    return {"delay": "s"}.get(free.what, "m" if is_linear else "rad")
+
+
+def _largest_quantile(slopes: Array, quantile: Array) -> Array:
+    """Return the largest quantile of the parameters on which each quantity depends."""
+    largest: Array = np.where(slopes != 0.0, quantile, QUANTILE).max(axis=1, initial=QUANTILE)
+    return largest
+
+
+def _errors(covariance: Array) -> Array:
+    """Return standard errors; inf of entries without a variance."""
+    variance = np.diag(covariance)
+    return np.where(variance > 0.0, np.sqrt(np.maximum(variance, 0.0)), np.inf)
+
+
+def logged_motion(log: Log) -> Trajectory:
+    """Return the motion of a log of commands: positions and their numerical derivatives."""
+    dt, v, still = np.diff(log.t), np.zeros_like(log.q), np.zeros_like(log.q)
+    segment = np.append(0, np.cumsum(dt > _GAP * np.median(dt)))
+    for rows in (segment == k for k in range(segment[-1] + 1)):
+        if rows.sum() > 1:
+            v[rows] = np.gradient(log.q[rows], log.t[rows], axis=0)
+    return Trajectory(log.t, log.q, v, still, still, log.joints, None, segment)
 
 
 def loop_findings(
@@ -173,7 +398,15 @@ def _of_fit(result: PositionIdentification) -> Iterator[Finding]:
             yield finding("torque_mismatch", "", joint, missed_pct=100 * share)
     if result.is_scaled_by_gain:
         yield finding("scale", severity="note", subject="controller", what="gains")
-    yield from _gains_contradicted(result)
+    scale, factor = result.fit.scale, 1.0
+    if scale is not None and scale.is_wrong:  # bodies or torques indicate other gains
+        factor += scale.common
+        kp = zip(result.model.joints, (factor * result.fit.loops.kp).tolist(), strict=True)
+        yield finding(
+            "gains_contradicted", subject="controller", what=result.fit.simulator.knows_torques,
+            agreeing=listed([f"{joint} = {value:.3g}" for joint, value in kp], _NAMED),
+            scale=factor, std_error=scale.common_error,
+        )  # fmt: skip
     if (halving := float(estimate.details.get("halving", 0.0))) > 1.0:
         step = float(estimate.details["step"])
         yield finding("coarse_steps", subject="fit", halving=halving, step=step, limit=CHANGE)
@@ -183,37 +416,26 @@ def _of_fit(result: PositionIdentification) -> Iterator[Finding]:
     if names := result.undetermined:
         has_gains = any(name.endswith((".kp", ".kd")) for name in names)
         yield _named("undetermined:commands", names, cure=has_gains)
-    yield from _at_rest(result)
+    moves = np.any([run.moves for run in result.fitted], axis=0)
+    friction = [x for x in result.fit.simulator.free_parameters if x.what == "term"]
+    at_rest = [x.name for x in friction if not moves[list(x.joints)].any()]
+    if left := [name for name in at_rest if name not in names]:
+        yield _named("undetermined:rest", left)
     yield from _limits_found(result)
     yield from _unequal_gains(result)
     yield from _encoder_findings(result)
     for tried in result.fit.tried:
-        terms, gain = " and ".join(tried.terms), 100 * tried.gain
+        figures: Any = {"terms": " and ".join(tried.terms), "gain_pct": 100 * tried.gain}
         if tried.dropped:
-            yield finding(
-                "friction_dropped", "", tried.joint, terms=terms, gain_pct=gain,
-                dropped=tried.dropped,
-            )  # fmt: skip
+            yield finding("friction_dropped", "", tried.joint, **figures, dropped=tried.dropped)
         elif tried.is_chosen:
-            yield finding("friction_found", "", tried.joint, terms=terms, gain_pct=gain)
+            yield finding("friction_found", "", tried.joint, **figures)
 
 
 def _named(code: str, names: Sequence[str], **values: Any) -> Finding:  # noqa: ANN401
     """Return a finding about parameters."""
     words = listed(names, _NAMED)
     return finding(code, subject=words, names=words, **values)
-
-
-def _at_rest(result: PositionIdentification) -> Iterator[Finding]:
-    """Yield which friction terms and offsets are of joints that no fitted log commands to move."""
-    moves = np.any([run.moves for run in result.fitted], axis=0)
-    names = [
-        free.name
-        for free in result.fit.simulator.free_parameters
-        if free.what == "term" and not moves[list(free.joints)].any()
-    ]
-    if left := [name for name in names if name not in result.undetermined]:
-        yield _named("undetermined:rest", left)
 
 
 def _settled_delay(examined: Finding, result: PositionIdentification) -> Finding:
@@ -224,17 +446,11 @@ def _settled_delay(examined: Finding, result: PositionIdentification) -> Finding
     if examined.code != "slow_command":
         return examined
     estimate, free_parameters = result.estimate, result.fit.simulator.free_parameters
-    errors = [
-        float(error)
-        for free, error in zip(free_parameters, estimate.std_error, strict=True)
-        if free.what == "delay"
-    ]
+    errors = estimate.std_error[[free.what == "delay" for free in free_parameters]].tolist()
     if any(name.endswith("delay") for name in estimate.details["at_bound"]):
-        known = (
-            ". The delay of the fit is 0, its lower bound: its standard error is that of the "
-            "bound, not of the delay"
-        )
-        return examined.reworded(remedy=examined.remedy + known)
+        known = "its standard error is that of the bound, not of the delay"
+        remedy = f"{examined.remedy}. The delay of the fit is 0, its lower bound: {known}"
+        return examined.reworded(remedy=remedy)
     span = examined.evidence["longest"] - examined.evidence["shortest"]
     error = max(errors, default=0.0)
     if error > _KNOWN * span:
@@ -242,23 +458,8 @@ def _settled_delay(examined: Finding, result: PositionIdentification) -> Finding
     entry = entries()["slow_command:known"]
     fault = entry["message"].replace("{what}", entry["what"]["fitted" if errors else "stated"])
     evidence = {**examined.evidence, "std_error": error}
-    return examined.reworded(
-        severity="note", fault=fault, remedy=entry["remedy"], evidence=evidence
-    )
-
-
-def _gains_contradicted(result: PositionIdentification) -> Iterator[Finding]:
-    """Yield a finding if bodies or logged torques indicate gains other than those stated."""
-    scale, joints = result.fit.scale, result.model.joints
-    if scale is None or not scale.is_wrong:
-        return
-    factor = 1.0 + scale.common
-    kp = zip(joints, (factor * result.fit.loops.kp).tolist(), strict=True)
-    yield finding(
-        "gains_contradicted", subject="controller", what=result.fit.simulator.knows_torques,
-        agreeing=listed([f"{joint} = {value:.3g}" for joint, value in kp], _NAMED),
-        scale=factor, std_error=scale.common_error,
-    )  # fmt: skip
+    settled = {"severity": "note", "fault": fault, "remedy": entry["remedy"]}
+    return examined.reworded(**settled, evidence=evidence)
 
 
 def _at_bound(result: PositionIdentification) -> Iterator[Finding]:
@@ -274,20 +475,15 @@ def _at_bound(result: PositionIdentification) -> Iterator[Finding]:
         for free in free_parameters
         if free.what in _POSITIVE and free.name in at_bound
     }
-    at_zero = [
-        name
-        for name in at_bound
-        if name not in largest and name.rpartition(".")[2] not in _POSITIVE
-    ]
-    if at_zero:
-        gains = [name for name in ("kp", "kd") if getattr(loop, name) is not None]
-        stated = [*gains, *(["delay"] if loop.delay is not None else [])]
+    if at_zero := [name for name in at_bound if name not in {**largest, **least}]:
+        stated = [name for name in ("kp", "kd", "delay") if getattr(loop, name) is not None]
+        gains, remedies = [name for name in stated if name != "delay"], []
         wrong = f", or {' or '.join(stated)} in [controller] is wrong" if stated else ""
-        remedies = [f"command a motion that depends more on {listed(at_zero, _NAMED)}"]
-        if loop.delay is not None:
-            remedies.insert(0, "leave the delay out of [controller], so that it is fitted")
         if gains:
-            remedies.insert(0, f"compare {' and '.join(gains)} with the gains of the drive")
+            remedies.append(f"compare {' and '.join(gains)} with the gains of the drive")
+        if "delay" in stated:
+            remedies.append("leave the delay out of [controller], so that it is fitted")
+        remedies.append(f"command a motion that depends more on {listed(at_zero, _NAMED)}")
         todo = "; ".join(remedies)
         todo = f"{todo[0].upper()}{todo[1:]}"
         yield _named("at_bound:zero", at_zero, wrong=wrong, todo=todo)
@@ -311,10 +507,8 @@ def _unequal_gains(result: PositionIdentification) -> Iterator[Finding]:
         kp = result.fit.loops.kp[joints]
         if kp.max() > _UNEQUAL * kp.min() > 0 and np.isfinite(effort):
             names = [result.model.joints[j] for j in joints]
-            yield finding(
-                "unequal_gains", "", names, lowest=kp.min(), highest=kp.max(),
-                group=listed(map(quoted, names)),
-            )  # fmt: skip
+            ends, group = {"lowest": kp.min(), "highest": kp.max()}, listed(map(quoted, names))
+            yield finding("unequal_gains", "", names, **ends, group=group)
 
 
 def _limits_found(result: PositionIdentification) -> Iterator[Finding]:
@@ -323,11 +517,9 @@ def _limits_found(result: PositionIdentification) -> Iterator[Finding]:
     severity = "note" if result.loop.limit == "find" else "warning"
     for free, value, error in zip(free_parameters, estimate.theta, estimate.std_error, strict=True):
         if free.what == "limit" and free.name not in estimate.details["at_bound"]:
-            joint = result.model.limits[free.joints[0]]
-            unit = "N" if joint.type == "prismatic" else "N m"
-            yield finding(
-                "limit", "", joint.name, severity=severity, limit=value, std_error=error, unit=unit
-            )
+            joint, figures = result.model.joints[free.joints[0]], {"std_error": error}
+            figures |= {"limit": value, "unit": units_of(result.model, free)}
+            yield finding("limit", "", joint, severity=severity, **figures)
 
 
 def _encoder_findings(result: PositionIdentification) -> Iterator[Finding]:
@@ -336,11 +528,8 @@ def _encoder_findings(result: PositionIdentification) -> Iterator[Finding]:
         return
     encoders, undetermined = result.fit.encoders, []
     for j, joint in enumerate(result.model.joints):
-        figures = {
-            "zero": result.fit.loops.zero[j], "sign": encoders.sign[j], "gain": encoders.gain[j],
-            "explained": encoders.explained[j], "margin": encoders.margin[j],
-            "next_zero": encoders.next_zero[j], "next_sign": encoders.next_sign[j],
-        }  # fmt: skip
+        figures = {key: values[j] for key, values in vars(encoders).items()}
+        figures["zero"] = result.fit.loops.zero[j]
         other = bool(encoders.next_sign[j] != encoders.sign[j])
         if encoders.gain[j] > 0:
             sense = bool(encoders.sign[j] < 0)

@@ -6,7 +6,7 @@ of the gains that bodies and torques indicate.
 """
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,20 +17,20 @@ from robotid.diagnosis.decisions import SIMULATED_FAMILY, Round
 from robotid.dynamics.simulation.loops import friction_at_rest
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import OutputError, is_at_bound, linearised
-from robotid.identification.closed_loop.loop_simulator import FreeParameter, LoopSimulator
+from robotid.identification.closed_loop.loop_simulator import (
+    SIGNIFICANT,
+    FreeParameter,
+    LoopSimulator,
+)
 from robotid.robot.drive_term import ANYWHERE
 from robotid.robot.drives import FAMILIES, LoadFriction, PositionCoulomb
 
 _OFFERED = ("stribeck", "load", "position")  # candidate families
 _FOLDS = 6
-_FEWEST = 2  # smallest number of windows for a cross-validation
 _SLOW = 0.3  # Stribeck speed of candidates, over the typical speed of the joint
-_POSITIONS = 201  # at which the sign of the friction is checked
 _WIDE = 0.05  # smallest half-range of a position-dependent candidate [rad or m]
 
 _log = logging.getLogger(__name__)
-_GAINS = ("kp", "kd")
-_DIFFERS = 3.0  # smallest significant difference of a scale [standard errors]
 _LARGE = 0.05  # smallest relevant difference of a scale; missing friction terms cause smaller ones
 
 
@@ -38,7 +38,7 @@ _LARGE = 0.05  # smallest relevant difference of a scale; missing friction terms
 class Tried:
     """A candidate of a joint that was tried."""
 
-    joint: str  # the joint
+    joint: str
     terms: tuple[str, ...]  # names of its terms
     gain: float  # reduction of the joint's squared residual in held-out windows [-]
     is_chosen: bool  # whether it is chosen
@@ -48,12 +48,10 @@ class Tried:
 def candidates(simulator: LoopSimulator, torque: Array) -> list[tuple[FreeParameter, ...]]:
     """Return the candidate friction terms of each joint: torque (n,) [N m or N]."""
     model = simulator.robot.model
-    q = np.concatenate([w.log.q[w.counted] for w in simulator.windows])
+    measured = [w.log.q[w.counted] for w in simulator.windows]
     dt = float(np.median(np.diff(simulator.windows[0].log.t)))
-    v = np.abs(
-        np.concatenate([np.gradient(w.log.q[w.counted], dt, axis=0) for w in simulator.windows])
-    )
-    found = []
+    q, v = (np.concatenate(x) for x in (measured, [np.gradient(x, dt, axis=0) for x in measured]))
+    sets = []
     for j, joint in enumerate(model.joints):
         low, high, speed = q[:, j].min(), q[:, j].max(), float(np.sqrt(np.mean(v[:, j] ** 2)))
         if speed <= 0.0:
@@ -68,8 +66,8 @@ def candidates(simulator: LoopSimulator, torque: Array) -> list[tuple[FreeParame
                 size = half**term.order if isinstance(term, PositionCoulomb) else 1.0
                 spread = 1.0 if isinstance(term, LoadFriction) else torque[j] / size
                 free_parameters.append(FreeParameter.of_term(joint, term, (j,), 0.0, spread))
-            found.append(tuple(free_parameters))
-    return found
+            sets.append(tuple(free_parameters))
+    return sets
 
 
 def choose(
@@ -78,33 +76,30 @@ def choose(
     offered: Sequence[tuple[FreeParameter, ...]],
     estimator: OutputError,
 ) -> list[Tried]:
-    """Return which candidates lower the residual of held-out windows.
+    """Return which candidates lower the residual of held-out windows: theta (c,).
 
     Selection is greedy: each pass adds the best candidate of each joint.
-
-    theta (c,).
     """
     joints = simulator.robot.model.joints
-    if len(simulator.windows) < _FEWEST:
+    if len(simulator.windows) == 1:
         _log.warning(
-            "further friction terms are not tried: the logs have %d window to fit, and "
-            "cross-validation needs at least %d. Record a longer log, or set a shorter window in "
-            "[estimator]",
-            len(simulator.windows), _FEWEST,
-        )  # fmt: skip
+            "further friction terms are not tried: the logs have 1 window to fit, and "
+            "cross-validation needs at least 2. Record a longer log, or set a shorter window in "
+            "[estimator]"
+        )
     place = {name: k for k, name in enumerate(simulator.names)}
     sets = [[place[free.name] for free in free_parameters] for free_parameters in offered]
-    folds = _folds(simulator, theta, estimator)
-    rows = sum(fold.rows for fold in folds)  # of one joint, with unit noise
-    candidate_columns = {k for places in sets for k in places}
-    columns = [k for k in range(len(theta)) if k not in candidate_columns]
+    H, g, rows = _folds(simulator, theta, estimator)
+    columns = sorted({*range(len(theta))}.difference(*sets))
     remaining, chosen = set(range(len(sets))), set[int]()
     gains: dict[int, float] = {}
     while remaining:
-        removed = _gains(folds, columns, {s: sets[s] for s in remaining})
-        rounds = _by_joint(offered, removed, rows)
-        gains |= {s: this.share(s) for this in rounds for s in this.left}
-        best = [s for this in rounds for s in [this.best(SIMULATED_FAMILY)] if s is not None]
+        left: dict[int, dict[int, Array]] = {}  # by joint, of each of its candidates
+        for s, removed in _gains(H, g, columns, {s: sets[s] for s in remaining}).items():
+            left.setdefault(offered[s][0].joints[0], {})[s] = -removed
+        rounds = [Round(np.zeros(len(H)), of_joint, len(H), rows) for of_joint in left.values()]
+        gains |= {s: round_.share(s) for round_ in rounds for s in round_.left}
+        best = [s for s in (round_.best(SIMULATED_FAMILY) for round_ in rounds) if s is not None]
         if not best:
             break
         for s in sorted(best, key=lambda s: -gains[s]):
@@ -128,100 +123,75 @@ def impossible(simulator: LoopSimulator, theta: Array, tried: Sequence[Tried]) -
     Negative friction at some position would drive the joint: no simulation that comes to rest there
     has a solution. Beyond the range of the data, terms of the position are constant.
     """
-    # theta (c,)
+    model, loops, why = simulator.robot.model, simulator.loops(theta), {}
     weakest = {t.joint: t for t in sorted(tried, key=lambda t: -t.gain) if t.is_chosen}
-    found = {}
     for t in weakest.values():
-        model, loops = simulator.robot.model, simulator.loops(theta)
         j = model.joints.index(t.joint)
-        own = np.concatenate([w.log.q[w.counted, j] for w in simulator.windows])
-        q = np.linspace(own.min(), own.max(), _POSITIONS)
+        q = np.concatenate([w.log.q[w.counted, j] for w in simulator.windows])
         friction = friction_at_rest(loops, j, q)
         if (least := float(friction.min())) < 0.0:
             at = float(q[np.argmin(friction)])
             unit, force = ("m", "N") if t.joint in model.layout.prismatic else ("rad", "N m")
-            found[t] = f"the friction at {at:.3g} {unit} is {least:.2g} {force}, wanted 0 or more"
-    return found
+            why[t] = f"the friction at {at:.3g} {unit} is {least:.2g} {force}, wanted 0 or more"
+    return why
 
 
-def _by_joint(
-    offered: Sequence[tuple[FreeParameter, ...]], removed: Mapping[int, Array], rows: int
-) -> list[Round[int]]:
-    """Return the selection round of each joint's candidates, by their gain in each fold."""
-    joints: dict[int, dict[int, Array]] = {}
-    for s, gain in removed.items():
-        joints.setdefault(offered[s][0].joints[0], {})[s] = -gain
-    folds = max(map(len, removed.values()))
-    return [Round(np.zeros(folds), left, folds, rows) for left in joints.values()]
+def _folds(
+    simulator: LoopSimulator, theta: Array, estimator: OutputError
+) -> tuple[Array, Array, int]:
+    """Return the normal equations of each fold of windows, and the number of rows of one joint.
 
-
-@dataclass(frozen=True, eq=False)
-class _Fold:
-    """The normal equations of some windows, A'A and A'b, and the number of rows of one joint."""
-
-    H: Array  # (c, c)
-    g: Array  # (c,)
-    rows: int
-
-
-def _folds(simulator: LoopSimulator, theta: Array, estimator: OutputError) -> list[_Fold]:
-    """Return the problem split into folds of windows, with the prior split equally."""
-    count = min(_FOLDS, len(simulator.windows))
+    They are A'A, (K, c, c), and A'b, (K, c), with the prior split equally.
+    """
+    count, rows = min(_FOLDS, len(simulator.windows)), 0
     known = 1.0 / simulator.prior_std**2 / count
     H = np.tile(np.diag(known), (count, 1, 1))
-    g, rows = np.tile(known * (simulator.prior - theta), (count, 1)), [0] * count
+    g = np.tile(known * (simulator.prior - theta), (count, 1))
     parts = list(linearised(simulator, estimator.weights(simulator, theta), theta))
-    each = len(parts) // len(simulator.windows)  # parts of the robot
+    of_window = len(parts) // len(simulator.windows)  # parts of the robot
     for k, (A, b, columns) in enumerate(parts):
-        fold = (k // each) % count
+        fold = (k // of_window) % count
         H[fold][np.ix_(columns, columns)] += A.T @ A
         g[fold][columns] += A.T @ b
-        rows[fold] += len(b)
-    n = len(simulator.robot.model.joints)
-    return [_Fold(*fold) for fold in zip(H, g, (size // n for size in rows), strict=True)]
+        rows += len(b)
+    return H, g, rows // len(simulator.robot.model.joints)
 
 
-def _gains(
-    folds: Sequence[_Fold], columns: list[int], sets: dict[int, list[int]]
-) -> dict[int, Array]:
+def _gains(H: Array, g: Array, columns: list[int], sets: dict[int, list[int]]) -> dict[int, Array]:
     """Return by how much each set of further columns lowers the squares of each held-out fold.
 
     All are 0 if the other folds do not determine a parameter, as with short logs: then there is no
     cross-validation.
     """
-    gains = {s: np.zeros(len(folds)) for s in sets}
-    H, g = sum(fold.H for fold in folds), sum(fold.g for fold in folds)
+    gains = {s: np.zeros(len(H)) for s in sets}
     base = np.array(columns)
-    for k, fold in enumerate(folds):
-        H_f, g_f = H - fold.H, g - fold.g  # of the others
+    for k, (H_k, g_k) in enumerate(zip(H, g, strict=True)):
+        H_f, g_f = H.sum(axis=0) - H_k, g.sum(axis=0) - g_k  # of the others
         try:
             factor = scipy.linalg.cho_factor(H_f[np.ix_(base, base)])
         except scipy.linalg.LinAlgError:  # not positive definite
-            return {s: np.zeros(len(folds)) for s in sets}
+            return {s: np.zeros(len(H)) for s in sets}
         move = scipy.linalg.cho_solve(factor, g_f[base])
-        slope = fold.H[np.ix_(base, base)] @ move - fold.g[base]
-        for s, own in sets.items():
-            further = np.array(own)
+        before = move @ H_k[np.ix_(base, base)] @ move - 2 * g_k[base] @ move
+        for s, places in sets.items():
+            further = np.array(places)
             B = H_f[np.ix_(base, further)]
             X = scipy.linalg.cho_solve(factor, B)
             S = H_f[np.ix_(further, further)] - B.T @ X
             y = np.linalg.lstsq(S, g_f[further] - B.T @ move, rcond=None)[0]
-            d = -X @ y
-            change = 2 * slope @ d + d @ fold.H[np.ix_(base, base)] @ d
-            across = fold.H[np.ix_(further, base)] @ (move + d) - fold.g[further]
-            change += 2 * y @ across + y @ fold.H[np.ix_(further, further)] @ y
-            gains[s][k] = -float(change)
+            both, step = np.append(base, further), np.concatenate([move - X @ y, y])
+            gains[s][k] = before - step @ H_k[np.ix_(both, both)] @ step + 2 * g_k[both] @ step
     return gains
 
 
 @dataclass(frozen=True, eq=False)
 class GainScale:
-    """Relative change of the gains that makes them consistent with bodies and torques."""
+    """Relative change of the gains that makes them consistent with bodies and torques [-]."""
 
-    change: Array  # relative change of each joint's gains, shape (n,) [-]
-    error: Array  # standard errors of ``change``, shape (n,); inf where it is not identifiable
-    common: float  # relative change of all gains by one factor [-]
-    common_error: float  # standard error of ``common``
+    change: Array  # of each joint's gains, shape (n,)
+    error: Array  # its standard errors, shape (n,); inf where it is not identifiable
+    common: float  # of all gains by one factor
+    common_error: float  # its standard error
 
     @property
     def is_wrong(self) -> bool:
@@ -229,10 +199,9 @@ class GainScale:
 
         Different factors indicate another model error, so that the gains are not questioned.
         """
-        agree = np.abs(self.change - self.common) <= _DIFFERS * np.hypot(
-            self.error, self.common_error
-        )
-        is_other = abs(self.common) > max(_DIFFERS * self.common_error, _LARGE)
+        error = np.hypot(self.error, self.common_error)
+        agree = np.abs(self.change - self.common) <= SIGNIFICANT * error
+        is_other = abs(self.common) > max(SIGNIFICANT * self.common_error, _LARGE)
         return bool(is_other and agree.all())
 
 
@@ -242,8 +211,12 @@ def gain_scale(simulator: LoopSimulator, estimator: OutputError, estimate: Estim
     All drive parameters scale with the gains; weight and inertia of the bodies do not, within their
     prior. The scale is of first order: one Gauss-Newton step of gains and all free parameters.
     """
-    n, c = len(simulator.base.kp), len(estimate.theta)
-    gains = tuple(_stated_gains(simulator))
+    n, c, gains = len(simulator.base.kp), len(estimate.theta), []
+    for what in ("kp", "kd"):
+        if any(free.what == what for free in simulator.free_parameters):
+            continue  # it is fitted, so that it scales with the other one
+        for j, value in enumerate(getattr(simulator.base, what).tolist()):
+            gains.append(FreeParameter(f"{what} of {j} as stated", what, (j,), value, np.inf))
     wide = replace(simulator, free_parameters=(*simulator.free_parameters, *gains))
     theta = np.concatenate([estimate.theta, [gain.prior for gain in gains]])
     H, g = estimator.normal(wide, estimator.weights(wide, theta), theta, frees=True)
@@ -256,19 +229,9 @@ def gain_scale(simulator: LoopSimulator, estimator: OutputError, estimate: Estim
     inflation = max(float(estimate.details["inflation"]), 1.0)
     change, error = _last(T.T @ H @ T, T.T @ g, n)
     together = np.column_stack([T[:, :-n], T[:, -n:].sum(axis=1)])
-    common, own = _last(together.T @ H @ together, together.T @ g, 1)
+    [common], [common_error] = _last(together.T @ H @ together, together.T @ g, 1)
     spread = np.sqrt(inflation)
-    return GainScale(change, spread * error, float(common[0]), float(spread * own[0]))
-
-
-def _stated_gains(simulator: LoopSimulator) -> Iterator[FreeParameter]:
-    """Yield the gains of all joints as free parameters without a prior."""
-    for what in _GAINS:
-        if any(free.what == what for free in simulator.free_parameters):
-            continue  # it is fitted, so that it scales with the other one
-        for j, value in enumerate(getattr(simulator.base, what).tolist()):
-            joint = simulator.robot.model.joints[j]
-            yield FreeParameter(f"{joint}.{what} as stated", what, (j,), value, np.inf)
+    return GainScale(change, spread * error, float(common), float(spread * common_error))
 
 
 def _last(H: Array, g: Array, n: int) -> tuple[Array, Array]:

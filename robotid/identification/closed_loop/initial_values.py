@@ -1,4 +1,4 @@
-"""Initial values and prior spreads of free parameters, from a second-order model of each joint.
+"""Initial values of the fit: a second-order model of each joint, and the zeros of encoders.
 
 J a + d v + Fc sign(v) + c = kp (q_ref(t - delay) - q) + kd (v_ref - v), decoupled, within a torque
 limit where one is fitted. Without a limit it is also a baseline of the fit with bodies.
@@ -6,19 +6,28 @@ limit where one is fitted. Without a limit it is also a baseline of the fit with
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 
 import numpy as np
 
 from robotid.base.exceptions import NotConvergedError
 from robotid.base.typing import Array
+from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
+from robotid.data.signals import zero_phase
+from robotid.dynamics.compiled import flatten
+from robotid.dynamics.prediction import predict_instants
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, Loops, Window
 from robotid.dynamics.simulation.simulation_settings import PerJoint
 from robotid.estimation.estimators.output_error import OutputError
-from robotid.identification.closed_loop.encoder_zeros import Encoders
 from robotid.identification.closed_loop.loop_settings import LoopSettings
-from robotid.identification.closed_loop.loop_simulator import FreeParameter, LoopSimulator
-from robotid.robot.drive_term import DriveTerm
+from robotid.identification.closed_loop.loop_simulator import (
+    LONGEST_DELAY,
+    FreeParameter,
+    LoopSimulator,
+    terms_of,
+)
 from robotid.robot.drives import TERMS, Viscous
 from robotid.robot.mass_matrix import joint_mass_matrices
 from robotid.robot.model import RobotModel
@@ -26,10 +35,9 @@ from robotid.robot.model import RobotModel
 _FREQUENCIES = (6.0, 12.0, 24.0, 48.0, 96.0)  # natural frequencies that are tried [rad/s]
 _DAMPINGS = (0.5, 1.5)  # damping ratios that are tried
 _FRICTIONS = (0.05, 0.5)  # Coulomb friction that is tried, over the typical torque
-_LIMITS = (0.6, 0.3, 0.15)  # torque limits that are tried, over the largest torque without a limit
+_LIMITS = (0.6, 0.3, 0.15)  # torque limits that are tried, from the mean torque to the largest one
 _DELAYS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08)  # delays that are tried [s]
-_TRIED = 8  # number of windows of the grid search
-_FITTED = 16  # number of windows of the fit
+_FITTED = 16  # number of windows of the fit; the grid search has the first half as many
 _SHOWS = 1e-3  # smallest identifiable inertia, over that of the fastest loop ...
 _CLEAR = 2.0  # ... and over its standard error
 _LOWEST = 1e-6  # lower bound of the inertia, over its initial value
@@ -37,23 +45,31 @@ _TERMS = (TERMS["viscous"], TERMS["coulomb"], TERMS["offset"])
 _STEPS = 12  # of the fit
 _WIDE = 10.0  # prior spread of drive parameters over their typical size: a weak prior
 _SHARE = 0.5  # initial share of the bodies in a joint's inertia, where its gain is unknown
-_DELAY_SPREAD = 0.1  # prior spread of a delay [s]
 _ZERO_SPREAD = 0.3  # prior spread of an encoder's zero about its first estimate [rad or m]
 _SMALLEST_BODY = 0.3  # smallest body inertia over the largest: small joints have gears, too
 _POSES = 50  # number of poses at which the inertia of the bodies is computed
 _LEAST = 0.05  # smallest initial armature and lower bound of a gain, over the typical size
 _LIMITED = 0.8  # initial torque limit over the largest torque without a limit
 
+#: Smallest relative increase of the squared error: by the URDF's zero and sign, for the best ones
+#: to replace them; by the next best ones, for the best ones to be identified.
+CLEAR = 0.2
+#: Signs and zeros of encoders that are tried.
+_TRIALS = np.array([(s, z) for s in (1.0, -1.0) for z in np.deg2rad(np.arange(-180, 180, 15))])
+_SAMPLES = 400  # of all logs together
+_SLOW, _FAST = 0.4, 4.0  # cut-offs of the slow motion and of the sign of friction [Hz]
+_PERIODS = 30  # smallest number of cut-off periods in all logs together
+_RANGE = 0.4  # smallest range of a joint whose zero is identified [rad]
+_SAME = 1.0 - 1e-6  # smallest cosine of parallel axes
+
 
 @dataclass(frozen=True, eq=False)
 class SecondOrder:
     """The second-order model of every joint; arrays of shape (n,)."""
 
-    simulator: LoopSimulator
-    theta: Array  # its parameters
-    loops: Loops  # the parameters as loops without bodies
+    loops: Loops  # its parameters as loops without bodies
     torque: Array  # typical torque of the loop, kp rms(q_ref - q) [N m or N]
-    inertia_error: Array | float = 0.0  # standard error of the inertia J [kg m^2 or kg]
+    inertia_error: Array  # standard error of the inertia J [kg m^2 or kg]
 
     @property
     def shows_inertia(self) -> Array:
@@ -84,75 +100,68 @@ class SecondOrder:
 
     def replaced(self, other: "SecondOrder", joints: Array) -> "SecondOrder":
         """Return the model with the values of another one for some joints: joints (n,)."""
-        each = np.repeat(joints, len(_TERMS))
-        changed = {
-            name: np.where(joints, getattr(other.loops, name), getattr(self.loops, name))
-            for name in ("armature", "delay", "limit")
-        }
-        values = np.where(each, other.loops.values, self.loops.values)
         error = np.where(joints, other.inertia_error, self.inertia_error)
-        loops = replace(self.loops, values=values, **changed)
+        loops = _loops_with(self.loops, other.loops, joints)
         return replace(self, loops=loops, inertia_error=error)
 
     def friction(self, name: str) -> Array:
         """Return the values of one friction term, shape (n,)."""
         which = [term.name for term in _TERMS].index(name)
-        found: Array = self.loops.values[which :: len(_TERMS)]
-        return found
+        values: Array = self.loops.values[which :: len(_TERMS)]
+        return values
+
+
+def _loops_with(loops: Loops, other: Loops, joints: Array) -> Loops:
+    """Return the loops with the second-order model of other loops for some joints: joints (n,)."""
+    changed = {}
+    for name in ("armature", "delay", "limit", "values"):
+        mask = np.repeat(joints, len(_TERMS)) if name == "values" else joints
+        changed[name] = np.where(mask, getattr(other, name), getattr(loops, name))
+    return replace(loops, **changed)
 
 
 def fit_second_order(
     robot: ClosedLoopRobot,
     windows: tuple[Window, ...],
     stated: Loops,
-    *,
     finds_delay: bool,
-    finds_limit: bool = False,
+    finds_limit: bool,
 ) -> SecondOrder:
     """Fit the second-order model to windows: a coarse grid for every joint, then least squares."""
     n = len(stated.kp)
     error = np.concatenate([w.log.q_ref[w.counted] - w.log.q[w.counted] for w in windows])  # type: ignore[index]
     torque = stated.kp * np.maximum(np.sqrt(np.mean(error**2, axis=0)), 1e-6)
+    # a drive bears the load by gravity within its limit
+    mean = stated.kp * error.mean(axis=0) * finds_limit
     bare = replace(
         stated,
         bodies=np.zeros_like(stated.bodies),
         zero=np.zeros(n),
         limit=np.full(n, np.inf),
         terms=(_TERMS,) * n,
-        values=np.zeros(n * len(_TERMS)),
+        values=np.column_stack([np.zeros((n, 2)), mean]).reshape(-1),
     )
-    largest = stated.kp * np.abs(error).max(axis=0)
-    limits = [share * largest for share in _LIMITS] if finds_limit else [bare.limit]
-    start = _coarse(robot, windows[:_TRIED], bare, torque, finds_delay, limits)
-    free_parameters = _free_parameters(robot, start, torque, finds_delay, finds_limit)
-    some = windows[:: max(1, len(windows) // _FITTED)]
-    simulator = LoopSimulator(robot, some, start, free_parameters)
-    estimate = OutputError(whitens=False, steps=_STEPS).fit(simulator)
-    is_inertia = [free.what == "armature" for free in free_parameters]  # joint by joint
-    error = estimate.std_error[is_inertia]
-    return SecondOrder(simulator, estimate.theta, simulator.loops(estimate.theta), torque, error)
-
-
-def _free_parameters(
-    robot: ClosedLoopRobot, start: Loops, torque: Array, finds_delay: bool, finds_limit: bool
-) -> tuple[FreeParameter, ...]:
-    """Return inertia, friction, offset, delay and limit of each joint as free parameters."""
-    found = []
+    least, largest = np.abs(mean), stated.kp * np.abs(error).max(axis=0)
+    limits = [least + share * (largest - least) for share in _LIMITS]
+    limits = limits if finds_limit else [bare.limit]
+    start = _coarse(robot, windows[: _FITTED // 2], bare, torque, finds_delay, limits)
+    free: list[FreeParameter] = []
     for j, joint in enumerate(robot.model.joints):
-        J = start.armature[j]
-        found.append(FreeParameter(f"{joint}.armature", "armature", (j,), J, 10 * J, _LOWEST * J))
+        J, T, F = float(start.armature[j]), float(start.delay[j]), float(start.limit[j])
+        free.append(FreeParameter(f"{joint}.armature", "armature", (j,), J, 10 * J, _LOWEST * J))
         for k, term in enumerate(_TERMS):
             value = float(start.values[len(_TERMS) * j + k])
             spread = 100 * torque[j] * (10.0 if term.name == "viscous" else 1.0)
-            found.append(FreeParameter.of_term(joint, term, (j,), value, spread))
+            free.append(FreeParameter.of_term(joint, term, (j,), value, spread))
         if finds_delay:
-            found.append(
-                FreeParameter(f"{joint}.delay", "delay", (j,), float(start.delay[j]), 0.1, 0.0)
-            )
+            free.append(FreeParameter(f"{joint}.delay", "delay", (j,), T, LONGEST_DELAY, 0.0))
         if finds_limit:
-            F = float(start.limit[j])
-            found.append(FreeParameter(f"{joint}.limit", "limit", (j,), F, 10 * F, _LOWEST * F))
-    return tuple(found)
+            free.append(FreeParameter(f"{joint}.limit", "limit", (j,), F, 10 * F, _LOWEST * F))
+    some = windows[:: max(1, len(windows) // _FITTED)]
+    simulator = LoopSimulator(robot, some, start, tuple(free))
+    estimate = OutputError(whitens=False, steps=_STEPS).fit(simulator)
+    is_inertia = [x.what == "armature" for x in free]  # joint by joint
+    return SecondOrder(simulator.loops(estimate.theta), torque, estimate.std_error[is_inertia])
 
 
 def _coarse(
@@ -164,14 +173,14 @@ def _coarse(
     limits: Sequence[Array],
 ) -> Loops:
     """Return the best of a grid for each joint: without bodies the joints are decoupled."""
-    n = len(bare.kp)
+    n, offset = len(bare.kp), bare.values[2 :: len(_TERMS)]
     best, found = np.full(n, np.inf), bare
     delays = np.array(_DELAYS) if finds_delay else np.zeros(1)
     first = float(delays[min(1, len(delays) - 1)])
     for w, z, f, limit in product(_FREQUENCIES, _DAMPINGS, _FRICTIONS, limits):
         J = bare.kp / w**2
         viscous = np.maximum(2 * z * w * J - bare.kd, 0.0)
-        values = np.column_stack([viscous, f * torque, np.zeros(n)]).reshape(-1)
+        values = np.column_stack([viscous, f * torque, offset]).reshape(-1)
         delay = np.full(n, first) if finds_delay else bare.delay
         trial = replace(bare, armature=J, values=values, delay=delay, limit=limit)
         best, found = _better(robot, windows, trial, best, found)
@@ -197,15 +206,7 @@ def _better(
         return best, found  # this trial cannot be simulated; others can
     cost = sum(((out.window.log.q[out.window.counted] - out.q) ** 2).sum(axis=0) for out in outs)
     better = cost < best
-    k = len(_TERMS)
-    values = np.where(np.repeat(better, k), trial.values, found.values)
-    return np.where(better, cost, best), replace(
-        found,
-        armature=np.where(better, trial.armature, found.armature),
-        delay=np.where(better, trial.delay, found.delay),
-        limit=np.where(better, trial.limit, found.limit),
-        values=values,
-    )
+    return np.where(better, cost, best), _loops_with(found, trial, better)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,8 +216,7 @@ class TypicalSizes:
     inertia: Array  # inertia of joint and rotor [kg m^2 or kg]
     bodies: Array  # part of the URDF's bodies in it [kg m^2 or kg]
     torque: Array  # torque [N m or N]
-    #: Initial torque limit: somewhat less than the largest torque without a limit [N m or
-    #: N].
+    #: Initial torque limit: somewhat less than the largest torque without a limit [N m or N].
     largest: Array
     speed: Array  # speed [rad/s or m/s]
     scale: Array  # torque relative to that of the second-order model [-]
@@ -238,9 +238,8 @@ def typical_sizes(
     not be that of its motion: more than the drive can overcome, and its simulation never moves.
 
     At its largest speed, ``top`` if more than 0, the limit of a drive is the friction torque.
-
-    has_gain (n,), top (n,) [rad/s or m/s], factor (n,) [-].
     """
+    # has_gain (n,), top (n,) [rad/s or m/s], factor (n,) [-]
     model = robot.model
     q = np.concatenate([w.log.q[w.counted] for w in windows])
     bodies = _inertia(model, model.standard_parameters(), windows)
@@ -269,7 +268,7 @@ def typical_sizes_of_torques(
     # pi (p,), armature (n,) [kg m^2 or kg]
     tau = np.concatenate([w.log.tau[w.counted] for w in windows])
     torque = np.maximum(np.sqrt(np.mean(tau**2, axis=0)), 1e-6)
-    inertia, one = _inertia(model, pi, windows), np.ones(len(armature))
+    inertia, one = _inertia(model, pi, windows), np.ones_like(armature)
     return TypicalSizes(inertia, inertia - armature, torque, np.inf * one, _speed(windows), one)
 
 
@@ -283,14 +282,9 @@ def _inertia(model: RobotModel, pi: Array, windows: Sequence[Window]) -> Array:
 
 def _speed(windows: Sequence[Window]) -> Array:
     """Return the typical speed of each joint, shape (n,)."""
-    steps = [np.diff(w.log.q[w.counted], axis=0) / _period(w) for w in windows]
+    steps = [np.diff(w.log.q[w.counted], axis=0) / np.median(np.diff(w.log.t)) for w in windows]
     speed: Array = np.maximum(np.sqrt(np.mean(np.concatenate(steps) ** 2, axis=0)), 1e-6)
     return speed
-
-
-def _period(window: Window) -> float:
-    """Return the time between the rows of a window's log [s]."""
-    return float(np.median(np.diff(window.log.t)))
 
 
 def first_loops(
@@ -300,11 +294,7 @@ def first_loops(
     friction = {name: plain.friction(name) * typical.scale for name in ("viscous", "coulomb")}
     none = np.zeros(len(typical.scale))
     terms = tuple(
-        tuple(
-            term
-            for d, term in model.layout.drive_parameters
-            if model.layout.drives[d].name == joint and not term.is_inertia
-        )
+        tuple(term for term in terms_of(model, joint) if not term.is_inertia)
         for joint in model.joints
     )
     values = [friction.get(t.name, none)[j] for j, own in enumerate(terms) for t in own]
@@ -326,7 +316,7 @@ def free_drive_parameters(
     base: Loops,
     typical: TypicalSizes,
     *,
-    finds_kd: Array | bool,
+    finds_kd: Array,
     finds_limit: Array,
 ) -> list[FreeParameter]:
     """Return the free parameters of drives and loops, with initial values from ``base``."""
@@ -353,7 +343,7 @@ def free_drive_parameters(
         "kp": base.kp / _WIDE,
         "kd": typical.torque / typical.speed,
         "limit": typical.torque,
-        "delay": np.full(len(groups), _DELAY_SPREAD / _WIDE),
+        "delay": np.full(len(groups), LONGEST_DELAY / _WIDE),
     }
     found = []
     for what, is_free in free.items():
@@ -368,20 +358,59 @@ def free_drive_parameters(
         for term in {t: None for j in joints for t in base.terms[j]}:
             having = [j for j in joints if term in base.terms[j]]
             # Coulomb friction and offset depend on wear and load, viscous friction on the type
-            for owners in [having] if isinstance(term, Viscous) else [[j] for j in having]:
+            is_viscous = isinstance(term, Viscous)
+            size = typical.torque / (typical.speed if is_viscous else 1.0)
+            for owners in [having] if is_viscous else [[j] for j in having]:
                 name = group if len(owners) > 1 else model.joints[owners[0]]
-                found.append(_term(name, term, owners, base, typical))
+                initial = float(np.median([base.values[base.place(j, term)] for j in owners]))
+                wide = _WIDE * float(np.median(size[owners]))
+                found.append(FreeParameter.of_term(name, term, tuple(owners), initial, wide))
     return found
 
 
-def _term(
-    owner: str, term: DriveTerm, joints: Sequence[int], base: Loops, typical: TypicalSizes
-) -> FreeParameter:
-    """Return the free parameter of a term of one joint, or of several that share it."""
-    initial = float(np.median([base.values[base.place(j, term)] for j in joints]))
-    size = typical.torque / (typical.speed if isinstance(term, Viscous) else 1.0)
-    wide = _WIDE * float(np.median(size[list(joints)]))
-    return FreeParameter.of_term(owner, term, tuple(joints), initial, wide)
+def likeness(model: RobotModel) -> list[tuple[object, ...]]:
+    """Return the properties in which equal joints agree: limits, mass and moments of the body."""
+    bodies = model.standard_parameters()[: model.layout.n_inertial].reshape(-1, 10)
+    return [
+        (limit.type, f"{limit.effort:.3g}", f"{limit.velocity:.3g}", *(f"{x:.2g}" for x in sizes))
+        for sizes, limit in zip(bodies[:, [0, 4, 6, 9]], model.limits, strict=True)
+    ]
+
+
+def is_stated(value: PerJoint | str | None, model: RobotModel) -> Array:
+    """Return whether a number is stated for each joint, shape (n,), bool."""
+    named = value if isinstance(value, Mapping) else () if value is None else model.joints
+    return np.isin(model.joints, list(named))
+
+
+@dataclass(frozen=True, eq=False)
+class Encoders:
+    """Encoder zeros and signs relative to the URDF, q_urdf = sign q + zero; arrays of shape (n,).
+
+    The load causes a position error of a servo's loop, q_ref - q = tau / kp + friction, so that a
+    regression on the URDF's torques determines zero and sign of each encoder. It uses the slow
+    motion: in fast motion lags are larger than the effect of gravity, and friction, which acts in
+    both directions, averages to zero. The common sign of joints with parallel axes is not
+    identifiable: the position errors by gravity are the same with all signs reversed.
+    """
+
+    sign: Array  # 1, or -1 of an encoder with the opposite sign
+    zero: Array  # position of the URDF where the encoder reads 0 [rad or m]
+    #: Reduction of the squared position error by a zero and sign other than the URDF's, as share of
+    #: the error with those of the URDF at all joints [-].
+    gain: Array
+    explained: Array  # share of the joint's own squared position error that gravity explains [-]
+    #: Relative increase of the squared error by the next best zero or sign, outside the
+    #: neighbourhood of the best [-]; 0 of prismatic joints and of joints that hardly move.
+    margin: Array
+    next_sign: Array  # of the next best ones
+    next_zero: Array
+
+
+def same_encoders(model: RobotModel) -> Encoders:
+    """Return encoders with the URDF's zeros and signs."""
+    one, none = np.ones(len(model.joints)), np.zeros(len(model.joints))
+    return Encoders(one, none, none, none, none, one, none)
 
 
 def free_zeros(model: RobotModel, encoders: Encoders) -> list[FreeParameter]:
@@ -394,21 +423,125 @@ def free_zeros(model: RobotModel, encoders: Encoders) -> list[FreeParameter]:
     ]
 
 
-def likeness(model: RobotModel) -> list[tuple[object, ...]]:
-    """Return the properties in which equal joints agree: limits, mass and moments of the body."""
-    bodies = model.standard_parameters()[: model.layout.n_inertial].reshape(-1, 10)
-    sizes = np.column_stack([bodies[:, 0], bodies[:, [4, 6, 9]]])
-    found: list[tuple[object, ...]] = []
-    for body, joint in zip(sizes, model.limits, strict=True):
-        digits = tuple(f"{x:.2g}" for x in body)
-        found.append((joint.type, f"{joint.effort:.3g}", f"{joint.velocity:.3g}", digits))
-    return found
+def parallel_axes(model: RobotModel) -> list[tuple[str, ...]]:
+    """Return the successive joints of each chain that have parallel axes."""
+    tree = flatten(model)
+    joined: dict[int, list[int]] = {}
+    for body in range(len(tree.parents)):
+        above, placement = int(tree.parents[body]), tree.joints[body]
+        axis = placement[36:39]
+        in_parent = (placement[:9] + placement[9:18]).reshape(3, 3).T @ axis  # constant there
+        parallel = above >= 0 and abs(float(in_parent @ tree.joints[above][36:39])) > _SAME
+        joined[body] = joined[above] if parallel else []
+        joined[body].append(int(tree.leaders[body]))
+    chains = {id(chain): tuple(model.joints[j] for j in chain) for chain in joined.values()}
+    return [chain for chain in chains.values() if len(chain) > 1]
 
 
-def is_stated(value: PerJoint | str | None, model: RobotModel) -> Array:
-    """Return whether a number is stated for each joint, shape (n,), bool."""
-    named = [
-        value is not None and (not isinstance(value, Mapping) or joint in value)
-        for joint in model.joints
-    ]
-    return np.array(named)
+def find_encoders(model: RobotModel, logs: Sequence[Log]) -> Encoders:
+    """Find zeros and signs of encoders from the position errors that gravity causes."""
+    length = sum(float(log.t[-1] - log.t[0]) for log in logs)
+    cutoff = min(max(_SLOW, _PERIODS / length), _FAST)
+    samples = [_smooth(log, max(_SAMPLES // len(logs), 50), cutoff) for log in logs]
+    motion = _Motion(*(np.concatenate(parts) for parts in zip(*samples, strict=True)))
+    N, n = motion.q.shape
+    is_revolute = np.array([joint.type != "prismatic" for joint in model.limits])
+    revolute = np.flatnonzero(is_revolute & (np.ptp(motion.q, axis=0) > _RANGE))
+    free, near = [*revolute], np.cos(1.5 * (_TRIALS[1, 1] - _TRIALS[0, 1]))
+    while True:
+        sign, zero, gain, cost, costs = _descend(model, motion, revolute, free)
+        margin, next_sign, next_zero = np.zeros(n), sign.copy(), zero.copy()
+        for j in revolute:
+            away = (_TRIALS[:, 0] != sign[j]) | (np.cos(_TRIALS[:, 1] - zero[j]) < near)
+            k = int(np.argmin(np.where(away, costs[j], np.inf)))
+            margin[j] = np.expm1((costs[j, k] - cost) / N)
+            next_sign[j], next_zero[j] = _TRIALS[k]
+        ambiguous = [j for j in free if gain[j] > 0 and margin[j] < CLEAR]
+        if not ambiguous:
+            break
+        free = [j for j in free if j not in ambiguous]  # these have the URDF's values
+    explained = 1.0 - motion.left(model, sign, zero) / motion.without
+    return Encoders(sign, zero, gain, explained, margin, next_sign, next_zero)
+
+
+def _descend(
+    model: RobotModel, motion: "_Motion", revolute: Array, free: Sequence[int]
+) -> tuple[Array, Array, Array, float, Array]:
+    """Return the best sign and zero of each free joint, the gain, and the costs.
+
+    The last two are the least cost, and the cost of each trial of each revolute joint.
+    """
+    N, n = motion.q.shape
+    sign, zero, gain = np.ones(n), np.zeros(n), np.zeros(n)
+    first = cost = motion.cost(model, sign, zero)
+    costs, moved = np.full((n, len(_TRIALS)), np.inf), True
+    while moved:
+        moved = False
+        for j in revolute:
+            for k, trial in enumerate(_TRIALS):
+                trial_sign, trial_zero = sign.copy(), zero.copy()
+                trial_sign[j], trial_zero[j] = trial
+                costs[j, k] = motion.cost(model, trial_sign, trial_zero)
+            k = int(np.argmin(costs[j]))
+            if j in free and costs[j, k] < cost - np.log1p(CLEAR) * N:
+                gain[j] += np.exp((cost - first) / N) - np.exp((costs[j, k] - first) / N)
+                (sign[j], zero[j]), cost, moved = _TRIALS[k], float(costs[j, k]), True
+    return sign, zero, gain, cost, costs
+
+
+def _smooth(log: Log, count: int, cutoff: float) -> tuple[Array, ...]:
+    """Return the slow motion at samples of a log: the arrays of ``_Motion``."""
+    dt = float(np.median(np.diff(log.t)))
+
+    def low_pass(x: Array, below: float) -> Array:
+        order = 2  # both ends are extended by 3 (order + 1) rows, as SciPy's filtfilt does
+        return zero_phase(x, order, min(below, 0.2 / dt), 1.0 / dt, 3 * (order + 1))
+
+    v = np.gradient(low_pass(log.q, _FAST), dt, axis=0)
+    direction = np.tanh(v / SignalSettings().min_velocity)  # friction reverses about this speed
+    motion = (log.q, v, np.gradient(v, dt, axis=0), log.q_ref - log.q, direction)
+    rows = np.linspace(0, len(log.t) - 1, count).astype(int)
+    return tuple(low_pass(x, cutoff)[rows] for x in motion)
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """Slow motion at N instants; arrays of shape (N, n)."""
+
+    q: Array
+    v: Array
+    a: Array
+    error: Array  # q_ref - q
+    direction: Array  # of friction
+
+    def cost(self, model: RobotModel, sign: Array, zero: Array) -> float:
+        """Return N times the summed log of the squared residuals of the position errors."""
+        left = np.maximum(self.left(model, sign, zero), 1e-300)
+        return len(self.q) * float(np.log(left).sum())
+
+    def left(self, model: RobotModel, sign: Array, zero: Array) -> Array:
+        """Return the squared residual of each joint's errors, (n,).
+
+        The torque is left out where its coefficient, the compliance of the loop, is negative.
+        """
+        q, v, a = (sign * x for x in (self.q, self.v, self.a))
+        torque = sign * predict_instants(model, model.standard_parameters(), q + zero, v, a)
+        left = self.without.copy()
+        for j in range(len(sign)):
+            x, with_torque = self._fit(j, torque[:, j : j + 1])
+            if x[-1] >= 0:
+                left[j] = with_torque
+        return left
+
+    @cached_property
+    def without(self) -> Array:
+        """Squared residual of each joint's errors without its torque, (n,)."""
+        joints, none = range(self.q.shape[1]), np.zeros((len(self.q), 0))
+        return np.array([self._fit(j, none)[1] for j in joints])
+
+    def _fit(self, j: int, torque: Array) -> tuple[Array, float]:
+        """Return coefficients and squared residual of a joint's errors: torque (N, 0 or 1)."""
+        plain = [np.ones(len(self.q)), self.v[:, j], self.direction[:, j], self.a[:, j]]
+        columns, e = np.column_stack([*plain, torque]), self.error[:, j]
+        x = np.linalg.lstsq(columns, e, rcond=None)[0]
+        return x, float(np.sum((e - columns @ x) ** 2))

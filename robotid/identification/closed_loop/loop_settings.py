@@ -1,7 +1,7 @@
 """Settings of the drives' closed loop in a job file: its known and its fitted parameters."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from robotid.base.exceptions import SettingsError
@@ -74,23 +74,20 @@ class LoopSettings(Settings):
         super().__post_init__()
         if self.kind != "torque":
             return
-        for each in fields(self):
-            if each.name in _OF_LOOPS and getattr(self, each.name) != each.default:
-                how = (
-                    " The delay of a logged torque is [signals] torque_delay."
-                    if each.name == "delay"
-                    else ""
-                )
+        default = LoopSettings()
+        for name in _OF_LOOPS:
+            if (value := getattr(self, name)) != getattr(default, name):
+                how = " The delay of a logged torque is [signals] torque_delay."
                 raise SettingsError(
-                    f"[controller] {each.name} is {getattr(self, each.name)!r}, but with kind = "
-                    "'torque' the logged torque drives the robot, without a controller. Leave "
-                    f"{each.name} out, or set kind = 'pd'.{how}"
+                    f"[controller] {name} is {value!r}, but with kind = 'torque' the logged torque "
+                    f"drives the robot, without a controller. Leave {name} out, or set kind = "
+                    f"'pd'.{how if name == 'delay' else ''}"
                 )
 
 
 def groups_of(settings: LoopSettings, joints: Sequence[str], alike: Sequence[Any]) -> list[str]:
     """Return the group of each joint."""
-    found: dict[str, str] = {}
+    group_of: dict[str, str] = {}
     for group, members in settings.groups.items():
         if isinstance(members, str) or not isinstance(members, Sequence):
             raise SettingsError(
@@ -102,25 +99,22 @@ def groups_of(settings: LoopSettings, joints: Sequence[str], alike: Sequence[Any
                     f"controller: groups.{group} has {joint!r}, which is not a moving joint: "
                     f"{listed(joints)}{suggestion(joint, joints)}"
                 )
-            if joint in found:
+            if joint in group_of:
                 raise SettingsError(
-                    f"controller: joint {joint!r} is in the groups {found[joint]} and {group}; "
+                    f"controller: joint {joint!r} is in the groups {group_of[joint]} and {group}; "
                     "name it once"
                 )
-            found[joint] = group
+            group_of[joint] = group
     if settings.groups:
-        return [found.get(joint, joint) for joint in joints]
-    first: dict[Any, str] = {}
-    named = [first.setdefault(key, joint) for key, joint in zip(alike, joints, strict=True)]
-    return [
-        joint if named.count(name) == 1 else _common(name, joints, named)
-        for name, joint in zip(named, joints, strict=True)
-    ]
+        return [group_of.get(joint, joint) for joint in joints]
+    alike_joints: dict[Any, list[str]] = {}
+    for key, joint in zip(alike, joints, strict=True):
+        alike_joints.setdefault(key, []).append(joint)
+    return [_common(alike_joints[key]) for key in alike]
 
 
-def _common(name: str, joints: Sequence[str], named: Sequence[str]) -> str:
+def _common(joints: Sequence[str]) -> str:
     """Return the name of a group: the words common to its joints' names, or its first joint."""
-    members = [joint for joint, first in zip(joints, named, strict=True) if first == name]
-    shared = [word for word in members[0].split("_") if all(word in m.split("_") for m in members)]
-    shared = [word for word in shared if word != "joint"]
-    return "_".join(shared) or members[0]
+    common = set.intersection(*(set(joint.split("_")) for joint in joints)) - {"joint"}
+    words = [word for word in joints[0].split("_") if word in common]
+    return joints[0] if len(joints) == 1 else "_".join(words) or joints[0]

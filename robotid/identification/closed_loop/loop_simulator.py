@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -16,9 +17,11 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 from robotid.robot.prior import with_assumed_inertials
 
-_AROUND = (0, -1, 1)  # lags that are tried about the known delay [samples]
-_LATEST = 0.1  # largest lag that is tried [s]
-_CLEAR = 9.0  # improvement that a fractional lag needs [variances of one row]
+#: Largest delay that is tried [s].
+LONGEST_DELAY = 0.1
+#: Smallest significant difference [standard errors].
+SIGNIFICANT = 3.0
+
 _WHOLE = 0.15  # distance from a whole lag below which the lag is whole [samples]
 _SMOOTH = 0.02  # half-width of the differentiating filter [s]
 _FREE = 0.95  # torque relative to the limit, below which the drive is not saturated
@@ -54,24 +57,20 @@ class DriveTorques:
     ) -> Array:
         """Return the derivatives of the torques of some drives, shape (N, k, c).
 
-        The command is constant over a row, so a delay changes only the motion.
-
-        joints (k,), motion (N, 2k, c).
+        The command is constant over a row, so a delay changes only the motion, (N, 2k, c).
         """
-        k, loops = len(joints), self.loops
-        change: Array = (
-            -loops.kp[joints, None] * motion[:, :k] - loops.kd[joints, None] * motion[:, k:]
-        )
-        own = {kinds["kp"]: self.position_error, kinds["kd"]: self.speed_error}
-        at_limit = (np.abs(self.unlimited) >= loops.limit)[:, joints]
+        k, kp, kd = len(joints), self.loops.kp[joints, None], self.loops.kd[joints, None]
+        change: Array = -kp * motion[:, :k] - kd * motion[:, k:]
+        at_limit = np.abs(self.unlimited) >= self.loops.limit
+        by_kind = {
+            kinds["kp"]: self.position_error * ~at_limit,
+            kinds["kd"]: self.speed_error * ~at_limit,
+            kinds["limit"]: np.sign(self.unlimited) * at_limit,
+        }
+        change[at_limit[:, joints]] = 0.0
         for c, (kind, joint, _) in columns:
-            if kind in own:
-                change[:, joints == joint, c] += own[kind][:, [joint]]
-        change[at_limit] = 0.0
-        for c, (kind, joint, _) in columns:
-            if kind == kinds["limit"]:
-                side = np.sign(self.unlimited[:, [joint]])
-                change[:, joints == joint, c] += at_limit[:, joints == joint] * side
+            if kind in by_kind:
+                change[:, joints == joint, c] += by_kind[kind][:, [joint]]
         return change
 
 
@@ -106,17 +105,18 @@ def measured_motion(window: Window) -> RollOut:
 def find_gains(
     outs: Sequence[RollOut], loops: Loops, is_free: Array, *, knows_delay: bool, is_whole: bool
 ) -> tuple[Array, Loops]:
-    """Return the lag of measured torques, and the loops with gains fitted to these torques.
+    """Return the lag of measured torques, (n,) [samples], and the loops with gains fitted to them.
 
     A command that is constant over a row jumps between rows, and with it the torque of a stiff
     loop. The lag of least squared error is taken; a fractional one, as of torques averaged over a
     row, only where the improvement is significant. Gains whose estimate is negative do not change.
-
-    is_free (2, n) -> (n,) [samples].
     """
     dt = float(np.median(np.diff(outs[0].window.log.t)))
     delayed = np.ceil(loops.delay / dt - 1e-6)
-    around = _AROUND if knows_delay else range(-int(delayed.min()), 1 + round(_LATEST / dt))
+    # a known delay is that of a row at most one row away
+    around = (
+        range(-1, 2) if knows_delay else range(-int(delayed.min()), 1 + round(LONGEST_DELAY / dt))
+    )
     tries = np.array([np.maximum(delayed + rows, 0.0) for rows in around])
     costs = np.array([_fit_gains(outs, loops, is_free, lag)[0] for lag in tries])
     lag, least = tries[np.argmin(costs, axis=0), np.arange(len(delayed))], costs.min(axis=0)
@@ -129,7 +129,7 @@ def find_gains(
         bend, slope = 2 * (least + next_ - 2 * half), 4 * half - 3 * least - next_
         share = np.clip(-slope / np.maximum(2 * bend, 1e-300), 0.0, 1.0)
         gain = -(slope + bend * share) * share
-        is_between = (gain > _CLEAR * least / rows) & (share > _WHOLE)
+        is_between = (gain > SIGNIFICANT**2 * least / rows) & (share > _WHOLE)
         lag = np.where(is_between, whole + side * share, lag)
     gains = _fit_gains(outs, loops, is_free, lag)[1]
     kp, kd = np.where(gains > 0, gains, [loops.kp, loops.kd])
@@ -142,17 +142,17 @@ def _fit_gains(
     """Return the squared torque residuals, (n,), and the gains of least squares, (2, n)."""
     torques = [drive_torques(out, loops, lag) for out in outs]
     unlimited, error, speed_error = (
-        np.concatenate([getattr(own, name) for own in torques])
+        np.concatenate([getattr(torque, name) for torque in torques])
         for name in ("unlimited", "position_error", "speed_error")
     )
     tau = np.concatenate([out.window.log.tau[out.window.counted] for out in outs])
     squares, gains = np.zeros(len(lag)), np.stack([loops.kp, loops.kd])
-    for j, is_own in enumerate(is_free.T):
+    for j, is_fitted in enumerate(is_free.T):
         free = np.abs(tau[:, j]) < _FREE * loops.limit[j]
-        A = np.column_stack([error[free, j], speed_error[free, j]])[:, is_own]
+        A = np.column_stack([error[free, j], speed_error[free, j]])[:, is_fitted]
         b = (tau - unlimited)[free, j]
-        more = np.linalg.lstsq(A, b, rcond=None)[0] if is_own.any() else np.zeros(0)
-        gains[is_own, j] += more
+        more = np.linalg.lstsq(A, b, rcond=None)[0] if is_fitted.any() else np.zeros(0)
+        gains[is_fitted, j] += more
         squares[j] = np.sum((b - A @ more) ** 2)
     return squares, gains
 
@@ -165,11 +165,11 @@ class FreeParameter:
     #: "armature", "kp", "kd", "limit", "delay", "zero", "term", or "body": a coordinate of
     #: the difference between a body and the URDF's.
     what: str
-    joints: tuple[int, ...]  # indices of the joints
-    prior: float  # prior value
+    joints: tuple[int, ...]  # their indices
+    prior: float
     spread: float  # prior standard deviation; inf without a prior
-    lowest: float = -np.inf  # lower bound
-    highest: float = np.inf  # upper bound
+    lowest: float = -np.inf
+    highest: float = np.inf
     term: DriveTerm | None = None  # the friction term
     coordinate: int = 0  # number of a body's coordinate, 0 to 3
 
@@ -193,19 +193,16 @@ def free_body_parameters(robot: ClosedLoopRobot, spread: float) -> list[FreePara
     References:
         Rucker, Wensing (2022), Smooth parameterization of rigid-body inertia, (12)-(14).
     """
-    model = robot.model
-    J = pseudo_inertia(model.standard_parameters()[: model.layout.n_inertial])
-    values = np.linalg.eigvalsh(J)
-    parameters = []
-    for body, joint in enumerate(robot.joint_of_body):
-        if values[body, 0] <= _POSSIBLE * values[body, -1]:
-            continue  # a massless frame or an inconsistent body of the URDF stays fixed
-        name = model.layout.bodies[body]
-        parameters += [
-            FreeParameter(f"{name}.{what}", "body", (joint,), 0.0, spread, coordinate=k)
-            for k, what in enumerate(("mass", "cx", "cy", "cz"))
-        ]
-    return parameters
+    layout = robot.model.layout
+    J = pseudo_inertia(robot.model.standard_parameters()[: layout.n_inertial])
+    is_possible = [low > _POSSIBLE * high for low, *_, high in np.linalg.eigvalsh(J)]
+    bodies = zip(layout.bodies, robot.joint_of_body, is_possible, strict=True)
+    return [
+        FreeParameter(f"{name}.{what}", "body", (joint,), 0.0, spread, coordinate=k)
+        for name, joint, is_free in bodies
+        if is_free  # a massless frame or an inconsistent body of the URDF stays fixed
+        for k, what in enumerate(("mass", "cx", "cy", "cz"))
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,11 +219,10 @@ class LoopSimulator:
     """A robot in closed loop with free parameters and windows of logs, for an estimator."""
 
     robot: ClosedLoopRobot
-    windows: tuple[Window, ...]  # windows of its logs
+    windows: tuple[Window, ...]
     base: Loops  # values of the loops; the free parameters replace theirs
-    free_parameters: tuple[FreeParameter, ...]  # the free parameters
-    #: Rows of measured torques along the measured motion; None if not used.
-    torque: "TorqueRows | None" = None
+    free_parameters: tuple[FreeParameter, ...]
+    torque: TorqueRows | None = None  # of measured torques along the measured motion
     velocities: bool = False  # whether measured velocities are compared in addition to positions
     #: Lag of each torque after its command, shape (n,) [samples], as in ``drive_torques``;
     #: None if torques of roll-outs are not compared.
@@ -238,6 +234,11 @@ class LoopSimulator:
     @cached_property
     def names(self) -> tuple[str, ...]:
         return tuple(free.name for free in self.free_parameters)
+
+    @cached_property
+    def body_of(self) -> dict[int, int]:
+        """The index of the body of each joint."""
+        return {joint: body for body, joint in enumerate(self.robot.joint_of_body)}
 
     @cached_property
     def prior(self) -> Array:
@@ -254,17 +255,14 @@ class LoopSimulator:
 
     def loops(self, theta: Array) -> Loops:
         """Return bodies, drives and loops at given values of the free parameters: theta (c,)."""
-        base = self.base
-        changed = {
-            name: getattr(base, name).copy()
-            for name in ("armature", "kp", "kd", "limit", "delay", "zero", "values")
-        }
+        base, changed = self.base, dict[str, Any]()
         for free, value in zip(self.free_parameters, theta, strict=True):
+            if free.what == "body":
+                continue
+            name, places = free.what, list(free.joints)
             if free.term is not None:
-                places = [base.place(j, free.term) for j in free.joints]
-                changed["values"][places] = value
-            elif free.what != "body":
-                changed[free.what][list(free.joints)] = value
+                name, places = "values", [base.place(j, free.term) for j in free.joints]
+            changed.setdefault(name, getattr(base, name).copy())[places] = value
         return replace(base, bodies=self._bodies(theta)[0], **changed)
 
     def roll_out(self, theta: Array, windows: Sequence[Window] | None = None) -> list[RollOut]:
@@ -275,8 +273,6 @@ class LoopSimulator:
         """Return the simulator with fitted initial states: measured ones have noise.
 
         With friction an initial error may persist, so that a lead before the window is not enough.
-
-        theta (c,).
         """
         n, loops, columns = len(self.base.kp), self.loops(theta), self._starts()
         windows = [replace(window, first=window.start_row) for window in self.windows]
@@ -306,10 +302,7 @@ class LoopSimulator:
         return replace(self, windows=tuple(replace(w, given=new.start) for w, new in both))
 
     def rows(self, theta: Array) -> tuple[Array, Array]:
-        """Return the derivatives and residuals of the torque rows; see ``Simulator``.
-
-        theta (c,).
-        """
+        """Return the derivatives and residuals of the torque rows; see ``Simulator``."""
         if self.torque is None:
             return np.zeros((0, len(theta))), np.zeros(0)
         R, K = self.torque.R, self.torque.K
@@ -320,8 +313,6 @@ class LoopSimulator:
         """Return the relative RMS error of the torques of roll-outs, shape (n,) [-].
 
         It is relative to the logged torque or that of the roll-outs, whichever is larger.
-
-        theta (c,).
         """
         if self.lag is None:
             return np.zeros(len(self.base.kp))
@@ -334,10 +325,7 @@ class LoopSimulator:
         return share
 
     def standard(self, model: RobotModel, theta: Array) -> tuple[Array, Array]:
-        """Return a robot's standard parameters, shape (p,), and their derivatives, shape (p, c).
-
-        theta (c,).
-        """
+        """Return a robot's standard parameters, shape (p,), and their derivatives, shape (p, c)."""
         layout, loops = model.layout, self.loops(theta)
         place, pi = {}, np.zeros(len(layout.names))
         pi[: layout.n_inertial] = loops.bodies.reshape(-1)
@@ -350,10 +338,9 @@ class LoopSimulator:
                 pi[i] = loops.values[loops.place(j, term)]
         slopes = np.zeros((len(pi), len(theta)))
         changes = iter(self._bodies(theta)[1])
-        body_of = {joint: body for body, joint in enumerate(self.robot.joint_of_body)}
         for k, free in enumerate(self.free_parameters):
             if free.what == "body":
-                first = 10 * body_of[free.joints[0]]
+                first = 10 * self.body_of[free.joints[0]]
                 slopes[first : first + 10, k] = next(changes)
                 continue
             for j in free.joints:
@@ -366,7 +353,6 @@ class LoopSimulator:
         self, theta: Array, *, with_slopes: bool, with_starts: bool = False
     ) -> list[Residual]:
         """Return measured minus simulated outputs, window by window; see ``Simulator``."""
-        # theta (c,)
         loops, (_, directions) = self.loops(theta), self._bodies(theta)
         columns = self._columns(loops) if with_slopes else []
         if with_starts:
@@ -375,8 +361,8 @@ class LoopSimulator:
         if not rolls or self.fine is not None:
             outs = (self.fine or self.robot).roll_out(loops, self.windows)
         if not rolls:
-            everything, none = np.arange(self._outputs), np.array([], dtype=int)
-            return [Residual(self._error(out, loops), None, everything, none) for out in outs]
+            errors, none = [self._error(out, loops) for out in outs], np.array([], dtype=int)
+            return [Residual(e, None, np.arange(e.shape[1]), none) for e in errors]
         coarse = self.robot.roll_out(
             loops, self.windows, [column for _, column in columns], directions,
             owners=[owner for owner, _ in columns],
@@ -394,13 +380,8 @@ class LoopSimulator:
         """Whether measured torques are fitted, along the measured motion or along roll-outs."""
         return self.torque is not None or self.lag is not None
 
-    @property
-    def _outputs(self) -> int:
-        """Number of compared outputs: positions, speeds, torques, in this order."""
-        return len(self.base.kp) * (1 + self.velocities + (self.lag is not None))
-
     def _error(self, out: RollOut, loops: Loops) -> Array:
-        """Return measured minus simulated outputs, shape (N, outputs)."""
+        """Return measured minus simulated positions, speeds, torques, shape (N, outputs)."""
         counted, parts = out.window.counted, [_error(out)]
         if self.velocities:
             parts.append(out.window.log.v[counted] - out.v)  # type: ignore[index]
@@ -421,13 +402,13 @@ class LoopSimulator:
             parts = [slopes[:, :k], *([slopes[:, k:]] if self.velocities else [])]
             if torques is not None:
                 place = {int(owner): c for c, owner in enumerate(places)}
-                by = [(place[owner], own) for owner, own in columns if owner in place]
+                by = [(place[owner], column) for owner, column in columns if owner in place]
                 parts.append(torques.slopes(joints, by, slopes, self.robot.kinds))
             slopes = np.concatenate(parts, axis=1)
             outputs = np.concatenate([joints + n * i for i in range(len(parts))])
-            own = places[places < free_parameters]  # initial states follow
-            by_start = slopes[:, :, len(own) :]
-            yield Residual(error[:, outputs], slopes[:, :, : len(own)], outputs, own, by_start)
+            free = places[places < free_parameters]  # initial states follow
+            by_start = slopes[:, :, len(free) :]
+            yield Residual(error[:, outputs], slopes[:, :, : len(free)], outputs, free, by_start)
 
     def _starts(self) -> list[Column]:
         """Return the columns of the initial positions and speeds of windows."""
@@ -452,27 +433,24 @@ class LoopSimulator:
         """Upper triangular root U of the pseudo-inertia of each free body, shape (n, 4, 4)."""
         roots = np.zeros((len(self.base.bodies), 4, 4))
         J = pseudo_inertia(self.base.bodies.reshape(-1))
-        body_of = {joint: body for body, joint in enumerate(self.robot.joint_of_body)}
-        for body in {body_of[u.joints[0]] for u in self.free_parameters if u.what == "body"}:
+        for body in {self.body_of[u.joints[0]] for u in self.free_parameters if u.what == "body"}:
             roots[body] = np.linalg.cholesky(J[body, ::-1, ::-1])[::-1, ::-1]
         return roots
 
     def _bodies(self, theta: Array) -> tuple[Array, Array]:
         """Return the bodies, (n, 10), and their derivatives by each coordinate, (D, 10)."""
         bodies, directions = self.base.bodies.copy(), []
-        body_of = {joint: body for body, joint in enumerate(self.robot.joint_of_body)}
-        by_body: dict[int, list[int]] = {}
-        for k, free in enumerate(self.free_parameters):
+        by_body: dict[int, list[tuple[tuple[int, int], float]]] = {}
+        for free, value in zip(self.free_parameters, theta, strict=True):
             if free.what == "body":
-                by_body.setdefault(body_of[free.joints[0]], []).append(k)
-        for body, places in by_body.items():
+                entries = by_body.setdefault(self.body_of[free.joints[0]], [])
+                entries.append((_ENTRIES[free.coordinate], float(value)))
+        for body, entries in by_body.items():
             U, T = self._roots[body], np.eye(4)
-            for k in places:
-                row, column = _ENTRIES[self.free_parameters[k].coordinate]
-                T[row, column] = np.exp(theta[k]) if row == column else theta[k]
+            for (row, column), value in entries:
+                T[row, column] = np.exp(value) if row == column else value
             bodies[body] = inertial_from_pseudo_inertia(U @ T @ T.T @ U.T)
-            for k in places:
-                row, column = _ENTRIES[self.free_parameters[k].coordinate]
+            for (row, column), _ in entries:
                 change = np.zeros((4, 4))
                 change[row, column] = T[row, column] if row == column else 1.0
                 half = U @ change @ T.T @ U.T
@@ -482,21 +460,16 @@ class LoopSimulator:
 
 def with_terms(model: RobotModel, loops: Loops) -> RobotModel:
     """Return the model extended by the terms of loops that it lacks."""
-    own = {
-        joint: [
-            *model.layout.own.get(joint, ()),
-            *(t for t in terms if t not in _has(model, joint)),
-        ]
-        for joint, terms in zip(model.joints, loops.terms, strict=True)
-    }
-    extended = RobotModel.from_urdf(
-        model.tree, **{**model.options, "own_terms": {k: v for k, v in own.items() if v}}
-    )
+    own = dict(model.layout.own)
+    for joint, terms in zip(model.joints, loops.terms, strict=True):
+        if more := [term for term in terms if term not in terms_of(model, joint)]:
+            own[joint] = (*own.get(joint, ()), *more)
+    extended = RobotModel.from_urdf(model.tree, **{**model.options, "own_terms": own})
     return with_assumed_inertials(extended)
 
 
-def _has(model: RobotModel, joint: str) -> list[object]:
-    """Return the terms that the model has of a joint."""
+def terms_of(model: RobotModel, joint: str) -> list[DriveTerm]:
+    """Return the drive terms that the model has of a joint."""
     layout = model.layout
     return [term for d, term in layout.drive_parameters if layout.drives[d].name == joint]
 

@@ -13,7 +13,6 @@ from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, Loops, cut_windows
 from robotid.estimation.fitting.evaluation import Extent, JointMetrics, Metrics
-from robotid.robot.model import RobotModel
 
 #: Horizons after which a simulation restarts from the measured state [s].
 HORIZONS = (0.1, 0.5, 2.0)
@@ -115,17 +114,15 @@ def run_open_loop(
         baselines["steady"] = _size(np.concatenate(moved) - np.concatenate(drifts))
     else:
         baselines["command"] = _size(log.q_ref - log.q)
+    lengths = [h for h in horizons if h < log.t[-1] - log.t[0]]
+    errors = {h: _error(robot, loops, log, h) for h in lengths}
     return PositionEvaluation(
         log=log,
-        units=_position_units(robot.model),
+        units=tuple("m" if x in robot.model.layout.prismatic else "rad" for x in log.joints),
         q=q,
         rmse=np.sqrt(np.nanmean((log.q - q) ** 2, axis=0)),
         baselines=baselines,
-        horizons={
-            h: error
-            for h in horizons
-            if h < log.t[-1] - log.t[0] and (error := _error(robot, loops, log, h)) is not None
-        },
+        horizons={h: error for h, error in errors.items() if error is not None},
         spread=_size(np.concatenate(moved)) if is_driven else np.std(log.q, axis=0),
     )
 
@@ -141,10 +138,6 @@ def pool_positions(runs: Sequence[PositionEvaluation], *, moving: bool = False) 
         if of_joint := [run for run in runs if not moving or run.moves[j]]:
             per_joint[joint] = _joint_metrics(of_joint, j)
     return Metrics(per_joint, _mean(rmse for run in runs for rmse in run.rmse))
-
-
-def _position_units(model: RobotModel) -> tuple[str, ...]:
-    return tuple("m" if joint in model.layout.prismatic else "rad" for joint in model.joints)
 
 
 def _joint_metrics(runs: Sequence[PositionEvaluation], j: int) -> JointMetrics:

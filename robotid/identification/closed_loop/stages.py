@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from itertools import product
 
 import numpy as np
@@ -27,7 +27,6 @@ from robotid.dynamics.simulation.simulation_settings import by_joint
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import OutputError
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
-from robotid.identification.closed_loop.encoder_zeros import Encoders, find_encoders, same_encoders
 from robotid.identification.closed_loop.further_parameters import (
     GainScale,
     Tried,
@@ -37,13 +36,16 @@ from robotid.identification.closed_loop.further_parameters import (
     impossible,
 )
 from robotid.identification.closed_loop.initial_values import (
+    Encoders,
     SecondOrder,
+    find_encoders,
     first_loops,
     fit_second_order,
     free_drive_parameters,
     free_zeros,
     is_stated,
     likeness,
+    same_encoders,
     typical_sizes,
     typical_sizes_of_torques,
 )
@@ -73,13 +75,11 @@ STAGES = (
 
 _WHITE = 2.0  # cut-off of the whitening, relative to 1 / time constant of the loop
 _SCALES = (1.0, 0.1, 10.0, 0.01, 1e3)  # of torques with unknown gains; at 1e3 bodies hardly count
-_FEW = 12  # number of windows of the first fit
-_SOME = 48  # number of windows of the fits before the last improvement of initial states
+_FEW = 12  # number of windows of the first fit; fits before the last one have four times as many
 _STARTS = 3  # number of fits with improved initial states of the windows
 _WINDOW, _LEAD = 2.5, 0.6  # default window and lead of closed-loop simulations [s]
-_BOTH = 2.0  # variance factor: the noise of a torque is in its rows and in the simulation it drives
-_FINEST = 16.0  # largest reduction of the step
-_SETTLING = 4  # largest number of steps of parameters and initial states together
+_BOTH = 2.0  # of variances: the noise of a torque is in its rows and in the simulation it drives
+_HALVINGS = 4  # largest number of halvings of the step, and of steps with initial states together
 _RAISED = 1e-2  # largest increase of the mean log residual in such a step
 _PASSES = 2  # of choosing terms and fitting again
 
@@ -89,7 +89,7 @@ class Fitted:
     """Result of the fit."""
 
     simulator: LoopSimulator  # the robot with its free parameters, and the windows
-    estimate: Estimate  # the estimate of the free parameters
+    estimate: Estimate
     #: The second-order model of each joint; None where the logged torque drives the robot.
     plain: SecondOrder | None
     encoders: Encoders  # zeros and signs of the encoders relative to the URDF's joints
@@ -117,13 +117,13 @@ def fit_loops(
 ) -> Fitted:
     """Fit drives, loops and bodies to logs of commands and positions."""
     task = _Task(model, logs, loop, settings, signals, progress)
-    _check_settings(model, logs, loop, settings)
+    _check_logs(logs, loop, settings)
     initialise = _initialise_from_torque if loop.kind == "torque" else _initialise_from_commands
     initialised, theta = _best_start(initialise(task))
     simulator, estimator = initialised.simulator, initialised.estimator
     is_plain, every = initialised.linear is None, simulator.windows
     if is_plain:
-        simulator = replace(simulator, windows=_few(every, _SOME))
+        simulator = replace(simulator, windows=_few(every, 4 * _FEW))
     for left in reversed(range(_STARTS)):
         if not left and np.any(initialised.limited):
             simulator, theta = _with_limits_reached(initialised, simulator, theta)
@@ -209,21 +209,16 @@ def _with_chosen_terms(
 ) -> tuple[LoopSimulator, Estimate, list[Tried]]:
     """Return the fit with the friction terms that held-out windows confirm, and those tried.
 
-    It starts from a simulator, its parameters, and their estimate if the fit is complete; terms
-    that were ``dropped`` are not offered again, by name of their first parameter.
+    Terms that were ``dropped`` are not offered again, by name of their first parameter.
     """
-    simulator, theta, estimate = fitted
+    simulator, theta, estimate = fitted  # no estimate of a rough fit
     tried: list[Tried] = []
     for _ in range(passes):
         report_stage(task.progress, "trying friction terms", STAGES)
-        offered = [
-            set_
-            for set_ in candidates(simulator, initialised.torque)
-            if set_[0].name not in simulator.names and set_[0].name not in dropped
-        ]
-        judged = choose(
-            *_with(simulator, theta, offered), offered, replace(estimator, inflation=1.0)
-        )
+        known = {*simulator.names, *dropped}
+        offered = [x for x in candidates(simulator, initialised.torque) if x[0].name not in known]
+        uninflated = replace(estimator, inflation=1.0)
+        judged = choose(*_with(simulator, theta, offered), offered, uninflated)
         tried = [*(t for t in tried if t.is_chosen), *judged]
         chosen = [set_ for set_, t in zip(offered, judged, strict=True) if t.is_chosen]
         if not chosen and estimate is not None:
@@ -232,7 +227,8 @@ def _with_chosen_terms(
         simulator, theta = _with(simulator, theta, chosen)
         if simulator.torque is not None:
             from_rows = task.from_rows(with_terms(task.model, simulator.base))
-            simulator = replace(simulator, torque=torque_rows(from_rows, initialised.share))
+            inflation = 1.0 if initialised.linear is None else _BOTH
+            simulator = replace(simulator, torque=torque_rows(from_rows, inflation))
         estimate = estimator.fit(simulator, theta)
         theta = estimate.theta
     assert estimate is not None  # of a rough fit, the first pass makes it
@@ -243,34 +239,36 @@ def _best_start(initial: "_Initial") -> tuple["_Initial", Array]:
     """Return the initial values with the best first fit, and its parameters, shape (c,).
 
     Others are tried where the error of a joint is larger than that of a good fit and hardly smaller
-    than that of its second-order model: other scales of the torques, and torque limits. Each group
-    of joints with one gain takes its best. A fit that cannot be simulated is no candidate.
+    than that of its second-order model: other scales of the torques. Torque limits are tried for
+    every error that is larger. Each group of joints with one gain takes its best. A fit that cannot
+    be simulated is no candidate.
     """
     if initial.vary is None or initial.plain is None:
-        return initial, _with_bodies_of_urdf(initial.simulator, initial.estimator)
-    n, groups = len(initial.torque), np.array(initial.groups)
+        return _first_fit(initial)[:2]
+    n, groups, fits = len(initial.torque), np.array(initial.groups), []
     factor, limited, best = np.ones(n), np.zeros(n, dtype=bool), np.full(n, np.inf)
-    fits, failures = [], []
     second_order = _errors_of(initial.simulator, initial.plain.loops)
-    for has_limit, scale in product((False, True), initial.scales):
+    for scale, has_limit in initial.starts:
         try:
             fits.append(_first_fit(initial.vary(np.full(n, scale), np.full(n, has_limit))))
-        except NotConvergedError as failure:
-            failures.append(failure)
+        except NotConvergedError as exception:
+            failure = exception
             continue
         error = fits[-1][2]
-        for members in (groups == group for group in dict.fromkeys(initial.groups)):
+        for members in (groups == group for group in set(initial.groups)):
             if np.mean(error[members] / best[members]) < 1.0 / BEATEN:
                 factor[members], limited[members], best[members] = scale, has_limit, error[members]
-        if not ((best > GOOD_POSITION) & (best > HARDLY * second_order)).any():
+        may_limit = not has_limit and (scale, True) in initial.starts
+        if not ((best > GOOD_POSITION) & (may_limit | (best > HARDLY * second_order))).any():
             break
     if not fits:
-        raise failures[0]
-    chosen = next((fit for fit in fits if fit[0].starts_as(factor, limited)), None)
-    if chosen is None:  # several groups, each from its best
+        raise failure
+    fits.sort(key=lambda fit: float(fit[2].max()))
+    chosen = [x for x in fits if (x[0].factor == factor).all() and (x[0].limited == limited).all()]
+    if not chosen:  # several groups, each from its best
         with suppress(NotConvergedError):
-            chosen = _first_fit(initial.vary(factor, limited))
-    initialised, theta, _ = chosen or min(fits, key=lambda fit: float(fit[2].max()))
+            chosen = [_first_fit(initial.vary(factor, limited))]
+    initialised, theta, _ = (chosen or fits)[0]
     return initialised, theta
 
 
@@ -289,19 +287,25 @@ def _with_limits_reached(
     other = initial.vary(initial.factor, initial.limited & matters).simulator
     values = dict(zip(simulator.names, theta.tolist(), strict=True))
     for name in {*simulator.names}.difference(other.names):
-        owner, _, what = name.rpartition(".")
-        if what == "kd":
-            values[f"{owner}.viscous"] += values[name]
-    kept = tuple(free for free in simulator.free_parameters if free.name in other.names)
+        if name.endswith(".kd"):
+            values[name.removesuffix("kd") + "viscous"] += values[name]
+    common = tuple(free for free in simulator.free_parameters if free.name in other.names)
     base = replace(simulator.base, limit=other.base.limit)
-    simulator = replace(simulator, base=base, free_parameters=kept)
+    simulator = replace(simulator, base=base, free_parameters=common)
     return simulator, np.array([values[name] for name in simulator.names])
 
 
 def _first_fit(initial: "_Initial") -> tuple["_Initial", Array, Array]:
-    """Return initial values, the parameters of a first fit, and its errors of positions."""
-    theta = _with_bodies_of_urdf(initial.simulator, initial.estimator)
-    return initial, theta, _errors_of(initial.simulator, initial.simulator.loops(theta))
+    """Return initial values, the parameters of a first fit to few windows, and its errors.
+
+    It is a fit of the drives alone: with free bodies, many scales have nearly the same residual.
+    """
+    simulator = initial.simulator
+    drives = tuple(free for free in simulator.free_parameters if free.what != "body")
+    few = replace(simulator, windows=_few(simulator.windows), free_parameters=drives)
+    theta = simulator.prior.copy()
+    theta[np.isin(simulator.names, few.names)] = replace(initial.estimator, rounds=1).minimise(few)
+    return initial, theta, _errors_of(simulator, simulator.loops(theta))
 
 
 def _errors_of(simulator: LoopSimulator, loops: Loops) -> Array:
@@ -319,22 +323,6 @@ def _errors_of(simulator: LoopSimulator, loops: Loops) -> Array:
     return np.where(np.ptp(q_ref, axis=0) > 0.0, share, 1.0)
 
 
-def _with_bodies_of_urdf(simulator: LoopSimulator, estimator: OutputError) -> Array:
-    """Return the parameters of a first fit of the drives alone to few windows, shape (c,).
-
-    With free bodies, many scales have nearly the same residual.
-    """
-    drives = [k for k, free in enumerate(simulator.free_parameters) if free.what != "body"]
-    few = replace(
-        simulator,
-        windows=_few(simulator.windows),
-        free_parameters=tuple(simulator.free_parameters[k] for k in drives),
-    )
-    theta = simulator.prior.copy()
-    theta[drives] = replace(estimator, rounds=1).minimise(few)
-    return theta
-
-
 @dataclass(frozen=True, eq=False)
 class _Initial:
     """The initial values of a fit."""
@@ -346,21 +334,13 @@ class _Initial:
     plain: SecondOrder | None = None
     linear: TorqueIdentification | None = None
     groups: tuple[str, ...] = ()  # of joints with one gain
-    scales: tuple[float, ...] = (1.0,)  # of the torques, from which fits may start
+    #: Scales of the torques from which fits may start, and whether torque limits are fitted.
+    starts: tuple[tuple[float, bool], ...] = ((1.0, False),)
     factor: Array = field(default_factory=lambda: np.ones(1))  # of the scale of torques, (n,)
     #: Whether a limit is fitted that was not asked for, shape (n,), bool.
     limited: Array = field(default_factory=lambda: np.zeros(1, dtype=bool))
     #: Returns other initial values by scales, shape (n,), and by which torque limits are fitted.
     vary: "Callable[[Array, Array], _Initial] | None" = None
-
-    def starts_as(self, factor: Array, limited: Array) -> bool:
-        """Return whether these are its scales and its joints with limits."""
-        return bool((self.factor == factor).all() and (self.limited == limited).all())
-
-    @property
-    def share(self) -> float:
-        """Factor of the variance of torque rows: 2 where roll-outs use the same torques."""
-        return 1.0 if self.linear is None else _BOTH
 
 
 def _initialise_from_commands(task: _Task) -> _Initial:
@@ -382,20 +362,20 @@ def _initialise_from_commands(task: _Task) -> _Initial:
         )
         has_gain, stated = has_gain | (matched.kp != stated.kp), matched
     report_stage(task.progress, "trying second-order models", STAGES)
-    second_order = cache(
-        lambda finds_limit: fit_second_order(
-            robot, windows, stated, finds_delay=loop.delay is None, finds_limit=finds_limit
-        )
-    )
+    second_order = cache(partial(fit_second_order, robot, windows, stated, loop.delay is None))
     plain, groups = second_order(False), groups_of(loop, model.joints, likeness(model))
-    top = _largest_speeds(model, loop, logs)
+    saturated = [largest_speeds(log) for log in logs]
+    # speed of the joints that run at their largest one, 0 of others
+    top = np.array([max(x.get(joint, 0.0) for x in saturated) for joint in model.joints])
+    may_limit = ~is_stated(None if loop.limit == "find" else loop.limit, model)
+    top, may_limit = np.where(may_limit, top, 0.0), may_limit & (loop.limit != "find")
     # positions alone determine only the sum of kd and viscous friction, except at a torque limit
     finds_kd = uses_torques or all(log.v_ref is not None for log in logs)
     dt = max(float(np.median(np.diff(log.t))) for log in logs)
     most = np.tile(np.exp(-_WHITE * dt / plain.time_constant), 3)  # positions, speeds, torques
     estimator = OutputError(most=most, progress=task.progress)
-    may_limit = ~is_stated(loop.limit, model) & (loop.limit != "find")
     scales = (1.0,) if has_gain.all() else _SCALES
+    starts = tuple(product(scales, (False, True) if may_limit.any() else (False,)))
 
     def vary(factor: Array, limited: Array) -> _Initial:
         limited = limited & may_limit
@@ -419,43 +399,36 @@ def _initialise_from_commands(task: _Task) -> _Initial:
             simulator = replace(simulator, torque=torque_rows(from_rows))
         return _Initial(
             simulator, estimator, typical.torque, encoders, plain,
-            groups=tuple(groups), scales=scales, factor=factor, limited=limited, vary=vary,
+            groups=tuple(groups), starts=starts, factor=factor, limited=limited, vary=vary,
         )  # fmt: skip
 
     report_stage(task.progress, "fitting loops", STAGES)
-    n = len(model.joints)
-    return vary(np.ones(n), np.zeros(n, dtype=bool))
+    return vary(np.ones(len(top)), np.zeros(len(top), dtype=bool))
 
 
 def _initialise_from_torque(task: _Task) -> _Initial:
-    """Return a robot driven by the logged torque, initialised from the torque rows alone.
-
-    Where the fit uses these rows, the prior of the bodies is their estimate from the rows; else
-    that of the URDF.
-    """
+    """Return a robot driven by the logged torque, initialised from the torque rows alone."""
     model, loop, settings = task.model, task.loop, task.settings
     report_stage(task.progress, "fitting torques", STAGES)
     from_rows = task.from_rows(model)
-    linear = open_loops(model, from_rows.standard)
-    is_urdf = not (settings.torques and settings.bodies)
-    base = replace(linear, bodies=stated_loops(model, loop).bodies) if is_urdf else linear
+    base = open_loops(model, from_rows.standard)
+    if not (settings.torques and settings.bodies):  # these rows determine no bodies of the fit
+        base = replace(base, bodies=stated_loops(model, loop).bodies)
     robot = ClosedLoopRobot(model, step=settings.step)
     windows = task.windows(task.logs, DRIFTS, 0.0)
     typical = typical_sizes_of_torques(model, from_rows.standard, base.armature, windows)
     groups = groups_of(loop, model.joints, range(len(model.joints)))
     none = np.zeros(len(groups), dtype=bool)
     free_parameters = free_drive_parameters(
-        model, loop, groups, base, typical, finds_kd=False, finds_limit=none
+        model, loop, groups, base, typical, finds_kd=none, finds_limit=none
     )
-    free_parameters += task.bodies(robot)
     simulator = LoopSimulator(
-        robot, windows, base, tuple(free_parameters), velocities=settings.velocities
-    )
+        robot, windows, base, (*free_parameters, *task.bodies(robot)),
+        torque=torque_rows(from_rows, _BOTH) if settings.torques else None,
+        velocities=settings.velocities,
+    )  # fmt: skip
     report_stage(task.progress, "fitting loops", STAGES)
-    if settings.torques:
-        simulator = replace(simulator, torque=torque_rows(from_rows, _BOTH))
-    estimator = OutputError(frees=True, progress=task.progress)
-    encoders = same_encoders(model)
+    estimator, encoders = OutputError(frees=True, progress=task.progress), same_encoders(model)
     return _Initial(simulator, estimator, typical.torque, encoders, linear=from_rows)
 
 
@@ -468,15 +441,14 @@ def refine_steps(
     stay those of the larger steps: they do not change the minimum. The change by the last halving
     is added to the covariance, since all further halvings together would change as much again.
     """
-    model, theta = simulator.robot.model, estimate.theta
     dt = float(np.median(np.diff(simulator.windows[0].log.t)))
-    step = dt / np.ceil(dt / simulator.robot.step - 1e-9)
-    finest, now = step / _FINEST, simulator
-    while True:
-        half = replace(simulator, fine=ClosedLoopRobot(model, step=0.5 * step, corrects=True))
-        change, error = estimator.moved(now, half, theta)
+    step, now = dt / np.ceil(dt / simulator.robot.step - 1e-9), simulator
+    for halvings in range(_HALVINGS + 1):
+        fine = ClosedLoopRobot(simulator.robot.model, step=0.5 * step, corrects=True)
+        half = replace(simulator, fine=fine)
+        change, error = estimator.moved(now, half, estimate.theta)
         share = float(np.max(np.abs(change) / np.maximum(error, 1e-300), initial=0.0))
-        if share <= CHANGE or 0.5 * step < finest:
+        if share <= CHANGE or halvings == _HALVINGS:
             break
         step, now = 0.5 * step, half
     now, estimate = _settled(now, estimator, estimate)
@@ -497,7 +469,7 @@ def _settled(
     parameters are fitted from the best initial states.
     """
     level, first = np.inf, estimate.theta
-    for _ in range(_SETTLING):
+    for _ in range(_HALVINGS):
         try:
             initialised = simulator.with_better_start(estimate.theta)
             settled = estimator.settle(initialised, estimate)
@@ -514,57 +486,38 @@ def _settled(
     return simulator, replace(estimate, covariance=estimate.covariance + np.outer(change, change))
 
 
-def _check_settings(
-    model: RobotModel, logs: Sequence[Log], loop: LoopSettings, settings: SimulationSettings
-) -> None:
+def _check_logs(logs: Sequence[Log], loop: LoopSettings, settings: SimulationSettings) -> None:
     """Refuse logs without a compared signal."""
-    if loop.kind != "torque" and not any(map(_has_motion, logs)):
+    commands = [x for log in logs for x in (log.q_ref, log.v_ref, log.tau_ref) if x is not None]
+    if loop.kind != "torque" and not any(np.ptp(x, axis=0).any() for x in commands):
         raise DataError(
             f"{listed(sorted({log.name for log in logs}))}: the commands of all joints are "
             "constant, wanted commands that move at least one joint. Record a motion, or check the "
             "columns of the commands"
         )
-    for log in logs:
-        if settings.velocities and (log.v is None or not is_trustworthy(log)):
-            lack = (
-                "has no velocities"
-                if log.v is None
-                else "has velocities that are delayed, coarse, or inconsistent with the positions"
-            )
+    for log in logs if settings.velocities else ():
+        if log.v is None or not is_trustworthy(log):
+            lack = "velocities that are delayed, coarse, or inconsistent with the positions"
             raise DataError(
-                f"estimator: velocities is true, but {log.name} {lack}. Record columns dq_ of "
-                "each joint, or leave velocities out"
+                f"estimator: velocities is true, but {log.name} has "
+                f"{'no velocities' if log.v is None else lack}. Record columns dq_ of each joint, "
+                "or leave velocities out"
             )
-
-
-def _has_motion(log: Log) -> bool:
-    """Return whether a log commands a joint to move, by position, speed or torque."""
-    given = [x for x in (log.q_ref, log.v_ref, log.tau_ref) if x is not None]
-    return any(bool((np.ptp(x, axis=0) > 0).any()) for x in given)
-
-
-def _largest_speeds(model: RobotModel, loop: LoopSettings, logs: Sequence[Log]) -> Array:
-    """Return the speed of joints that run at their largest speed without a stated limit; else 0."""
-    speed = np.zeros(len(model.joints))
-    for log in logs:
-        saturated = largest_speeds(log)
-        speed = np.maximum(speed, [saturated.get(joint, 0.0) for joint in model.joints])
-    is_free = ~is_stated(None if loop.limit == "find" else loop.limit, model)
-    return np.where(is_free, speed, 0.0)
 
 
 def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:
     """Return the loops as stated, with the URDF's bodies; kp is 1 where it is not stated."""
-    n, joints = len(model.joints), model.joints
-    limit = None if isinstance(loop.limit, str) else loop.limit  # "find": fitted
-    bodies = model.standard_parameters()[: model.layout.n_inertial].reshape(-1, 10)
+    n = len(model.joints)
+    default = {"kp": 1.0, "kd": 0.0, "limit": np.inf, "delay": 0.0}
+    stated = {name: getattr(loop, name) for name in default}
+    stated["limit"] = None if loop.limit == "find" else loop.limit
     return Loops(
-        bodies=bodies,
+        bodies=model.standard_parameters()[: model.layout.n_inertial].reshape(-1, 10),
         armature=np.zeros(n),
-        kp=by_joint(loop.kp, joints, "controller: kp", 1.0),
-        kd=by_joint(loop.kd, joints, "controller: kd", 0.0),
-        limit=by_joint(limit, joints, "controller: limit", np.inf),
-        delay=by_joint(loop.delay, joints, "controller: delay", 0.0),
+        **{
+            name: by_joint(value, model.joints, f"controller: {name}", default[name])
+            for name, value in stated.items()
+        },
         zero=np.zeros(n),
         terms=((),) * n,
         values=np.zeros(0),
@@ -586,18 +539,17 @@ def _with(
     simulator: LoopSimulator, theta: Array, sets: Sequence[tuple[FreeParameter, ...]]
 ) -> tuple[LoopSimulator, Array]:
     """Return the simulator with further terms at 0, and its parameters."""
-    further = [free for free_parameters in sets for free in free_parameters]
-    loops = simulator.base
-    terms = [list(joint_terms) for joint_terms in loops.terms]
-    for free in further:
-        if free.term is not None:
-            terms[free.joints[0]].append(free.term)
+    further, loops = [free for free_parameters in sets for free in free_parameters], simulator.base
+    terms = [
+        (*joint_terms, *(free.term for free in further if free.joints == (j,) and free.term))
+        for j, joint_terms in enumerate(loops.terms)
+    ]
     values = [
         loops.values[loops.place(j, term)] if term in loops.terms[j] else 0.0
         for j, joint_terms in enumerate(terms)
         for term in joint_terms
     ]
-    base = replace(loops, terms=tuple(map(tuple, terms)), values=np.array(values))
+    base = replace(loops, terms=tuple(terms), values=np.array(values))
     wide = replace(simulator, base=base, free_parameters=(*simulator.free_parameters, *further))
     return wide, np.concatenate([theta, np.zeros(len(further))])
 

@@ -25,7 +25,7 @@ from robotid.robot.parameters import pseudo_inertia
 
 if TYPE_CHECKING:
     from robotid.design.previews import Preview
-    from robotid.identification.closed_loop.loop_result import PositionIdentification
+    from robotid.identification.closed_loop.from_commands import PositionIdentification
 
 _LOOP_TERMS = ("kp", "kd", "delay", "limit", "zero")
 _EXTENT = ("samples", "rate", "start", "end", "rows_used", "segments")
@@ -43,7 +43,7 @@ def build_result(
         beside = found.urdf_with_drives[len(bodies) :].tolist()
         drives = [x | {"with_urdf": value} for x, value in zip(drives, beside, strict=True)]
     else:
-        from robotid.identification.closed_loop.loop_result import PositionIdentification
+        from robotid.identification.closed_loop.from_commands import PositionIdentification
 
         require_kind(found, PositionIdentification, "identification", "a robotid.Identification")
         assert isinstance(found, PositionIdentification)

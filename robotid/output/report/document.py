@@ -22,7 +22,7 @@ def write_report(
     if isinstance(identification, TorqueIdentification):
         report = torque_report(identification, at, replay)
     else:  # modules of the simulation are imported here
-        from robotid.identification.closed_loop.loop_result import PositionIdentification
+        from robotid.identification.closed_loop.from_commands import PositionIdentification
         from robotid.output.report.position_page import position_report
 
         assert isinstance(identification, PositionIdentification)

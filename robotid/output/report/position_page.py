@@ -10,7 +10,7 @@ from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.base.versions import versions
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
-from robotid.identification.closed_loop.loop_result import PositionIdentification
+from robotid.identification.closed_loop.from_commands import PositionIdentification
 from robotid.identification.closed_loop.position_errors import (
     DRIFTS,
     PositionEvaluation,

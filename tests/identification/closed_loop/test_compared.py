@@ -8,7 +8,7 @@ from helpers.mujoco_plant import plant, recorded
 
 from robotid.base.exceptions import DataError
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
-from robotid.identification.closed_loop.from_commands import identify_loops
+from robotid.identification.closed_loop.from_commands import identify_loops, loop_findings
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.stages import fit_loops
 
@@ -83,16 +83,23 @@ def test_torques_that_are_not_of_the_loop_are_named():
     log, _ = recorded(robot, rng, duration=1.0, rate=250.0, torque=0.5, noise=1e-3)
     gains = LoopSettings(kp={"joint_1": 600.0, "joint_2": 250.0})
 
-    def missed(tau, loop):
-        own = replace(log, tau=tau)
-        found = identify_loops(
-            robot.model, [own], [], loop, settings(torques=True, step=4e-3), chooses=False
-        )
-        return {f.where: f for f in found.findings if f.code == "torque_mismatch"}
+    def found(tau, loop):
+        own, chosen = replace(log, tau=tau), settings(torques=True, step=4e-3)
+        return identify_loops(robot.model, [own], [], loop, chosen, chooses=False)
 
-    before = missed(log.tau * [1.0, 0.02], gains)
+    def missed(result):
+        return {f.where: f for f in result.findings if f.code == "torque_mismatch"}
+
+    before = missed(found(log.tau * [1.0, 0.02], gains))
     assert set(before) == {"joint_2"}, "not the other, whose torque is its loop's"
     assert before["joint_2"].evidence["missed_pct"] == pytest.approx(97.4, abs=0.5)  # 98, and noise
     assert "% of the larger" in before["joint_2"].message
     assert before["joint_2"].severity == "warning"
-    assert set(missed(log.tau[:, ::-1], LoopSettings())) == {"joint_1", "joint_2"}
+    swapped = found(log.tau[:, ::-1], LoopSettings())
+    assert set(missed(swapped)) == {"joint_1", "joint_2"}
+    theta = swapped.estimate.theta.copy()
+    theta[[swapped.estimate.names.index(f"joint_{j}.kp") for j in (1, 2)]] = 60.0, 15.0
+    estimate = replace(swapped.estimate, theta=theta)
+    unequal = replace(swapped, fit=replace(swapped.fit, estimate=estimate))
+    [finding] = [f for f in loop_findings(unequal, ()) if f.code == "unequal_gains"]
+    assert (finding.where, finding.evidence) == ("joint_1, joint_2", {"lowest": 15, "highest": 60})

@@ -18,12 +18,11 @@ from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.position_errors import run_open_loop
 from robotid.identification.closed_loop.stages import fit_loops, stated_loops
 from robotid.output.files.entries import build_result
-from robotid.output.report.document import write_report
 from robotid.robot.drives import Coulomb, Offset, PositionCoulomb, Viscous
 
 NOISE = 1e-3  # [rad]: with less, that MuJoCo's friction is a little soft shows beside the errors
 SETTINGS = SimulationSettings(window=1.0, lead=0.3, bodies=0.0, step=2e-3)
-COARSE = replace(SETTINGS, step=4e-3)  # of logs at 250 Hz: the fit halves it where it matters
+COARSE = replace(SETTINGS, step=5e-3)  # more than a row of 250 Hz: the fit halves rows
 
 
 SLOW = finding("slow_command", "log", "hip", frequency=2.0, shortest=0.0, longest=0.09)
@@ -126,13 +125,12 @@ def test_the_drives_of_an_arm_are_recovered_with_steps_that_are_halved():
     assert (found.fitted[0].rmse < coarse.rmse).all(), "errors of the steps of the fit"
 
 
-def test_it_is_an_identification_as_others_are(found, tmp_path):
+def test_it_is_an_identification_as_others_are(found):
     layout, estimate = found.model.layout, found.estimate
     size, count = layout.n_inertial, len(found.base)
     name = f"Identification of {found.model.name}: {count} base parameters"
     assert repr(found) == f"<{name} by simulation, verdict good>"
     assert set(found.sources[:size]) == {"prior"}, "bodies stay: bodies=0"
-    assert np.isinf(found.standard_error[:size]).all()
     content = build_result(found, {"estimator": {"name": "simulation"}})
     entries = {entry["name"]: entry for entry in content["drive_parameters"]}
     share = dict(zip(estimate.names, found.shrunk, strict=True))
@@ -159,26 +157,6 @@ def test_it_is_an_identification_as_others_are(found, tmp_path):
     assert joint["relative_error_pct"] == pytest.approx(100 * run.rmse[1] / run.spread[1])
     command = run.baselines["command"][1]
     assert joint["command_relative_error_pct"] == pytest.approx(100 * command / run.spread[1])
-    page = write_report(found, tmp_path / "report.html").read_text()
-    assert "<strong>good</strong>" in page
-    assert f"{found.model.name}: drives from commands" in page
-
-
-def test_each_kept_log_is_judged(leg, found):
-    _, log, kept = leg
-    robot, loops = found.fit.simulator.robot, found.fit.loops
-    n = 400  # 0.8 s
-    short = replace(log, t=log.t[:n], q=log.q[:n], tau=log.tau[:n], q_ref=log.q_ref[:n])
-    assert list(run_open_loop(robot, loops, short).horizons) == [0.1, 0.5], "as long as the log"
-    [good], otherwise = found.validation, replace(kept, q=kept.q[::-1].copy())
-    poor = run_open_loop(robot, loops, otherwise)
-    for runs in ((good, poor), (poor, good)):
-        verdict = replace(found, validation=runs).verdict
-        assert verdict.status == "poor"
-        assert "simulated position error" in verdict.reasons[0]
-    verdict = replace(found, validation=()).verdict
-    assert verdict.status == "not evaluated"
-    assert verdict.reasons[0].endswith("no validation log given")
 
 
 def test_without_gains_the_scale_is_said_to_rest_on_the_urdf(scaleless):
@@ -307,6 +285,10 @@ def test_friction_by_position_is_found_where_it_is_and_nowhere_else(leg):
     exact = 0.25 + 0.5 * (q - centre) + (q - centre) ** 2
     np.testing.assert_allclose(size, exact, rtol=0.05)
     assert f"{name}.{terms[0].name}" in found.model.layout.names
+    moments, v = found.moments[name], np.gradient(log.q[:, 2], log.t)
+    moving = v[np.abs(v) > 0.05 * np.abs(v).max()]  # of its own speed
+    k = moments.terms.index("viscous")
+    assert moments.products[k, k] == pytest.approx(np.mean(moving**2), rel=1e-9)
 
 
 def test_gravity_that_a_controller_compensates_is_fed_forward(leg):

@@ -1,11 +1,15 @@
 """Where a fit begins: typical sizes, first loops and unknowns, by their equations."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from helpers.paths import URDF
 
+from robotid.data.log import Log
 from robotid.dynamics.prediction import predict_instants
-from robotid.identification.closed_loop.encoder_zeros import _Motion
+from robotid.dynamics.simulation.loops import cut_windows
+from robotid.identification.closed_loop.initial_values import _Motion, typical_sizes
 from robotid.robot.model import RobotModel
 
 
@@ -32,3 +36,24 @@ def test_a_load_that_would_push_a_loop_the_wrong_way_does_not_count(rng):
             assert best < 0.5 * bare
         cost = motion.cost(model, sign, zero)
         assert cost == pytest.approx(60 * np.log(left).sum())
+
+
+def test_an_initial_limit_is_the_friction_at_the_largest_speed_within_the_largest_torque(rng):
+    model, t = RobotModel.from_urdf(URDF / "planar_2r.urdf"), np.arange(100) / 100.0
+    q_ref, q = rng.uniform(-1.0, 1.0, (2, 100, 2))
+    log = Log(t, q, 0 * q, model.joints, q_ref=q_ref, has_torque=False)
+    friction, one = {"viscous": np.array([2.0, 200.0]), "coulomb": np.array([1.0, 3.0])}, np.ones(2)
+    plain = SimpleNamespace(
+        loops=SimpleNamespace(kp=np.array([30.0, 20.0]), limit=np.inf), inertia=one, torque=one,
+        shows_inertia=one > 0, friction=friction.__getitem__,
+    )  # fmt: skip
+    windows, has_gain = cut_windows(log, np.inf, 0.0), one > 0
+    of_errors = 0.8 * plain.loops.kp * np.abs(q_ref - q)[windows[0].counted].max(axis=0)
+    for top, wanted in (
+        ([0.0, 0.0], of_errors),
+        ([0.5, 0.5], [2.0, of_errors[1]]),  # the second would need more than it ever gave
+    ):
+        found = typical_sizes(
+            SimpleNamespace(model=model), plain, windows, has_gain, np.array(top), ["a", "b"]
+        )
+        np.testing.assert_allclose(found.largest, wanted)

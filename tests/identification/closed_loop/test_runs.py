@@ -9,7 +9,7 @@ from helpers.mujoco_plant import plant, recorded
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import segment_scores
-from robotid.identification.closed_loop.loop_result import loop_runs
+from robotid.identification.closed_loop.from_commands import loop_runs
 from robotid.identification.closed_loop.loop_simulator import FreeParameter, LoopSimulator
 from robotid.output.files.commanded import loops_of
 from robotid.robot.drives import Coulomb

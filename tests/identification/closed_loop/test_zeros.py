@@ -5,8 +5,8 @@ import pytest
 from helpers.mujoco_plant import plant, recorded
 
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
-from robotid.identification.closed_loop.encoder_zeros import CLEAR, find_encoders, parallel_axes
 from robotid.identification.closed_loop.from_commands import identify_loops
+from robotid.identification.closed_loop.initial_values import CLEAR, find_encoders, parallel_axes
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

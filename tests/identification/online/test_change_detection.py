@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from robotid.identification.online import ChangeDetector, Innovations, payload_of
+from robotid.identification.online import ChangeDetector, Innovations, load_spread, payload_of
 
 
 def test_noise_alone_is_no_change_and_a_shift_is_flagged_where_it_began(rng):
-    detector = ChangeDetector(3, 40.0, 4.0)
+    detector = ChangeDetector(3, 40.0)
     for k in range(20_000):
         assert detector.push(k * 0.1, rng.standard_normal(3) ** 2, 1.0) is None
     flagged = None
@@ -20,8 +20,7 @@ def test_noise_alone_is_no_change_and_a_shift_is_flagged_where_it_began(rng):
 
 
 def innovations(n=1, model_error=0.0):
-    detector = ChangeDetector(n, 40.0, 4.0)
-    return Innovations(np.full(n, 10.0), 0.01, 5.0, model_error, detector)
+    return Innovations(np.full(n, 10.0), 0.01, model_error, ChangeDetector(n, 40.0))
 
 
 def test_a_row_that_is_not_used_teaches_nothing():
@@ -52,12 +51,12 @@ def test_what_a_model_may_miss_is_no_change(model_error, is_flagged):
 
 
 def test_the_noise_and_what_the_parameters_leave_open_are_their_recursions(rng):
-    rms, dt, memory, model_error = np.array([10.0, 3.0]), 0.05, 1.5, 0.2
-    detector = ChangeDetector(2, 1e9, 4.0)
-    monitor = Innovations(rms, dt, memory, model_error, detector)
+    rms, dt, memory, model_error = np.array([10.0, 3.0]), 0.05, 5.0, 0.2
+    detector = ChangeDetector(2, 1e9)
+    monitor = Innovations(rms, dt, model_error, detector)
     variance, torque, seen = 0.01 * rms**2, rms**2, np.full(2, 20.0)
     open_, evidence = np.full(2, np.inf), np.zeros(2)
-    for k in range(80):
+    for k in range(160):
         used = rng.uniform(size=2) < 0.8
         tau, e, residual = rng.standard_normal((3, 2)) * [[8.0, 2.0]]
         doubt = rng.uniform(0.0, 0.45, 2) * variance
@@ -93,3 +92,5 @@ def test_a_load_is_the_generalised_least_squares_of_its_change_about_none(rng):
     wanted = np.linalg.solve(H, columns.T @ np.linalg.solve(C, change))
     np.testing.assert_allclose(found.parameters, wanted)
     np.testing.assert_allclose(found.std_error, np.sqrt(np.diag(np.linalg.inv(H))))
+    bodies = np.concatenate([[4.0, *[1.0] * 9], [2.0, 0.2, 0.6, 0.1, *[1.0] * 6]])
+    np.testing.assert_allclose(load_spread(bodies), 3.0 * np.repeat([1.0, 0.6, 0.36], [1, 3, 6]))

@@ -18,16 +18,24 @@ def run(identifier, log, start=0, end=None):
 
 @pytest.fixture(scope="module")
 def picked_up(panda):
-    log = payload_log(panda, np.random.default_rng(0))
-    return log, run(OnlineIdentifier(panda), log)
+    """Return an identifier after its log, and its estimates by time before the load."""
+    log, identifier = payload_log(panda, np.random.default_rng(0)), OnlineIdentifier(panda)
+    before = {}
+    for k in range(len(log.t)):
+        run(identifier, log, k, k + 1)
+        if 9.0 < log.t[k] < 10.5:
+            before[identifier.reading.t] = identifier.reading.theta
+    return before, identifier
 
 
 def test_a_load_picked_up_at_ten_seconds_is_flagged_and_weighed(picked_up):
-    _, identifier = picked_up
+    before, identifier = picked_up
     assert len(identifier.changes) == 1
     (change,) = identifier.changes
     assert 10.0 < change.flagged < 10.3
     assert change.onset == pytest.approx(10.0, abs=0.05)
+    [at] = [t for t, x in before.items() if (x == change.theta).all() and t < change.onset]
+    assert 0.0 <= change.onset - identifier.delay - at < 0.12  # the last of each tenth of a second
     load = identifier.payload()
     assert load.mass == pytest.approx(2.0, abs=0.06)
     assert load.mass_std_error < 0.03
@@ -104,6 +112,10 @@ def test_a_bad_sample_is_refused_without_harm(ur5, rng):
         clean.update(9.0, log.q[0], bad, log.q[0], log.tau[0])
     with pytest.raises(DataError, match=r"wanted \(6,\) each"):
         clean.update(9.0, log.q[0], bad[:5], log.q[0], log.tau[0])
+    with pytest.raises(DataError, match=r"q, tau have shapes \(6,\), \(5,\), wanted \(6,\) each"):
+        clean.update(9.0, log.q[0], log.tau[0][:5])
+    with pytest.raises(DataError, match="t must increase"):
+        clean.update(log.t[-1], log.q[0], log.tau[0])
 
 
 def test_before_the_robot_has_moved_there_is_no_estimate(ur5):

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from robotid.base.exceptions import DataError
 from robotid.identification.online import LiveSignals
 
 FIXED = np.array([False])
@@ -73,23 +72,3 @@ def test_full_turns_are_taken_out_of_joints_that_turn_freely():
     np.testing.assert_allclose(both[2][:, 0], v[:, 0], atol=1e-9)
     np.testing.assert_allclose(both[2][:, 1], alone[2][:, 0], atol=1e-9)
     assert np.abs(alone[2]).max() > 50.0
-
-
-def test_a_bad_sample_is_refused_and_leaves_no_trace():
-    t = np.arange(500) * 1e-3
-    q = np.sin(6 * t)[:, None]
-    clean, disturbed = (LiveSignals(1, 1000.0, 8.0, 4, FIXED) for _ in range(2))
-    expected = run(clean, t, q, q)
-    found = []
-    for k in range(len(t)):
-        found += list(disturbed.push(t[k], q[k], q[k]))
-        with pytest.raises(DataError, match="is not finite, so it was refused"):
-            disturbed.push(t[k] + 5e-4, q[k] * np.nan, q[k])
-        with pytest.raises(DataError, match="t must increase"):
-            disturbed.push(t[k], q[k], q[k])
-    for ours, theirs in zip(zip(*found, strict=True), expected, strict=True):
-        np.testing.assert_array_equal(np.array(ours), theirs)
-    for q, tau in ((np.zeros(2), np.zeros(1)), (np.zeros(1), np.zeros(2))):
-        shapes = rf"q has shape \({len(q)},\) and tau \({len(tau)},\), wanted \(1,\) each"
-        with pytest.raises(DataError, match=shapes):
-            clean.push(9.0, q, tau)
