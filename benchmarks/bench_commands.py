@@ -53,7 +53,7 @@ from robotid.identification.closed_loop.loop_simulator import LoopSimulator, fre
 from robotid.identification.closed_loop.position_errors import run_open_loop
 from robotid.identification.closed_loop.stages import stated_loops
 from robotid.identification.pipeline import identify
-from robotid.output.files.commanded import CommandedDrive, loops_of
+from robotid.output.files.result_file import CommandedDrive, loops_of
 from robotid.robot.drives import AUTO
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -21,7 +21,7 @@ from robotid.output.files.mjcf import write_mjcf
 from robotid.output.files.sdf import write_sdf
 from robotid.output.files.urdf import write_urdf
 from robotid.output.report import pictures
-from robotid.output.report.document import write_report
+from robotid.output.report.report_content import write_report
 from robotid.robot.constraints import Contact, Loop
 from robotid.robot.parameters import Coupling
 

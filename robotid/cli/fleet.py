@@ -42,7 +42,7 @@ from robotid.estimation.variation.groups import FEWEST_RUNS
 from robotid.estimation.variation.variation import FALSE_ALARMS, between_units
 from robotid.estimation.work_plan import Workload, WorkPlan
 from robotid.output.files.entries import build_result
-from robotid.output.report.fleet_page import fleet_page
+from robotid.output.report.comparison import fleet_page
 
 #: Columns of the table.
 COLUMNS = {

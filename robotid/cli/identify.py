@@ -68,8 +68,8 @@ from robotid.identification.summary import (
 )
 from robotid.output.files.entries import build_result
 from robotid.output.files.urdf import DYNAMICS_TERMS, write_urdf
-from robotid.output.report.document import write_report
 from robotid.output.report.next_steps import Origin, next_steps
+from robotid.output.report.report_content import write_report
 from robotid.robot.drive_term import DriveTerm
 from robotid.robot.drives import AUTO, wanted_families
 from robotid.robot.model import RobotModel

@@ -41,7 +41,7 @@ from robotid.output.files.result_file import (
 )
 from robotid.output.files.shape import check_shape, schema
 from robotid.output.report.pictures import shown_evaluation
-from robotid.output.viewer.replays import Bands, Mark, Replay, Torques, find_unexplained, replay
+from robotid.output.viewer.replays import Bands, Mark, Replay, Torques, replay
 from robotid.robot.model import RobotModel
 
 #: Columns of the pose of a floating base in the world: position [m] and quaternion.
@@ -126,7 +126,6 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
     else:
         torques = _torques(job, motion, model, robots, findings.results)
         torques = replace(torques, noise=_noise(findings, model))
-        marks += _contacts(torques, model)
         notes += [_PROJECTED] if model.constraints else []
     n = model.layout.n_inertial  # drives of the result may have further terms
     masses = {"URDF": model.standard_parameters(), **bodies} if bodies else {}
@@ -164,7 +163,6 @@ def replay_identified(identification: TorqueIdentification) -> Replay:
     return replay(
         model, motion.t, motion.q, torques=torques,
         masses={"URDF": identification.prior, "identified": identification.standard},
-        marks=_contacts(torques, model),
         notes=[f"Motion: {shown.recording.name}.", *([_PROJECTED] if model.constraints else [])],
         log=Path(shown.recording.log.path).name,
     )  # fmt: skip
@@ -316,21 +314,6 @@ def _limits_used(job: Job, motion: Log, model: RobotModel) -> tuple[list[Mark], 
         text = gap if near.distance > 0 else "convex hulls overlap"
         marks.append(Mark(near.time, f"{near.first} and {near.second}: {text}"))
     return marks, notes
-
-
-def _contacts(torques: Torques, model: RobotModel) -> list[Mark]:
-    """Return marks at large torque residuals of the first result."""
-    if not torques.predicted or model.constraints:
-        return []
-    predicted = next(iter(torques.predicted.values()))
-    units = dict(zip(model.row_names, model.row_units, strict=True))
-    marks = []
-    for found in find_unexplained(torques.t, torques.measured, predicted, model.joints):
-        size = f"mean {found.residual:.2g} {units[found.joint]}"
-        label = f"unexplained torque, largest at {found.joint} ({size}, for "
-        label += f"{found.end - found.start:.1f} s): contact or load?"
-        marks.append(Mark(found.start, label, "contact", found.joint))
-    return marks
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:

@@ -1,10 +1,6 @@
 """robotid track: run the online estimator over a log: history, step changes."""
 
 import argparse
-import sys
-import time
-from collections.abc import Callable
-from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -15,23 +11,15 @@ from robotid.base.exceptions import SettingsError
 from robotid.base.files import check_folder, file_sha256, folder_beside, write_json
 from robotid.base.text import columns, in_digits_of
 from robotid.base.versions import __version__
-from robotid.cli.console import Terminated, echo, show_found
+from robotid.cli.console import echo, show_found
 from robotid.cli.job import JOB, ONLINE, Job, add_out, add_shown, job_from_flags
 from robotid.data.files.read import write_columns
 from robotid.data.log import Log
-from robotid.dynamics.base_parameters import structural_mapping
-from robotid.identification.online import Observer, OnlineIdentifier, OnlineSettings, Track, track
+from robotid.identification.online import OnlineIdentifier, OnlineSettings, Track, track
 from robotid.output.files.result_file import SCHEMA_VERSION
-from robotid.output.viewer.replays import gap_marks, live_page
-from robotid.output.viewer.scene import coordinates
-from robotid.output.viewer.server import LivePage
-from robotid.robot.model import RobotModel
-
-_RATE = 25.0  # [Hz] messages per second of the log
-_SLOWEST = 1e-3  # [-] smallest speed, relative to real time
 
 
-def run_track(job: Job, folder: str | Path, *, observer: Observer | None = None) -> dict[str, Any]:
+def run_track(job: Job, folder: str | Path) -> dict[str, Any]:
     """Track the one log of a job, write the history and track.json, and return its content."""
     model = job.model()
     history = "track.parquet" if find_spec("pyarrow") else "track.csv"
@@ -48,7 +36,7 @@ def run_track(job: Job, folder: str | Path, *, observer: Observer | None = None)
     settings = OnlineSettings(
         rate=rate, cutoff=job.signals.cutoff, min_velocity=job.signals.min_velocity
     )
-    tracked = track(model, log, settings, observer=observer)
+    tracked = track(model, log, settings)
     content = _summary(tracked, job, log, history)
     target = Path(folder)
     target.mkdir(parents=True, exist_ok=True)
@@ -92,103 +80,17 @@ def _change(identifier: OnlineIdentifier, index: int) -> dict[str, Any]:
     return {"flagged": change.flagged, "onset": change.onset, "payload": payload}
 
 
-def serve_track(
-    job: Job,
-    folder: str,
-    *,
-    port: int = 0,
-    speed: float = 1.0,
-    announce: Callable[[str], None],
-    finished: Callable[[dict[str, Any]], None],
-    linger: bool = True,
-) -> dict[str, Any]:
-    """Track the one log of a job, show it in a live page, and return as ``run_track``."""
-    if not (speed == 0 or speed >= _SLOWEST):
-        raise SettingsError(f"speed is {speed}, wanted 0, or {_SLOWEST} or more")
-    if not 0 <= port < 2**16:
-        raise SettingsError(f"port is {port}, wanted 1 to 65535, or 0 for any free port")
-    model = job.model()
-    log = job.read(job.identification[0], model)
-    mapping = structural_mapping(model)
-    units = [model.layout.units[i] for i in mapping.independent]
-    html = live_page(model, mapping.base_names, units, log.q, model.standard_parameters())
-    with LivePage(html, port) as live:
-        announce(live.url)
-        content = run_track(job, folder, observer=_LiveFeed(live, model, log, speed))
-        live.finish()
-        finished(content)
-        while linger:
-            time.sleep(3600.0)
-    return content
-
-
-class _LiveFeed:
-    """Sends the estimates of a tracker to a live page, no faster than the time of the log."""
-
-    def __init__(self, live: LivePage, model: RobotModel, log: Log, speed: float) -> None:
-        self._live, self._model, self._log, self._speed = live, model, log, speed
-        self._due, self._marks = -np.inf, 0
-        self._gaps = gap_marks(log.t)  # those that are not sent yet
-        self._started = time.monotonic()
-
-    def __call__(self, k: int, identifier: OnlineIdentifier) -> None:
-        t, start = float(self._log.t[k]), float(self._log.t[0])
-        if t < self._due and k < len(self._log.t) - 1:  # the page ends at the last pose
-            return
-        self._due = t + 1.0 / _RATE
-        while self._gaps and self._gaps[0].t < t:
-            self._live.send({"mark": asdict(self._gaps.pop(0))})
-        if self._speed > 0:
-            ahead = (t - start) / self._speed - (time.monotonic() - self._started)
-            time.sleep(max(ahead, 0.0))
-        message = {"t": t, "q": coordinates(self._model, self._log.q[k : k + 1])[0].tolist()}
-        if identifier.is_ready:
-            reading, (tau, predicted) = identifier.reading, identifier.compared
-            message |= {
-                "at": reading.t, "tau": tau.tolist(), "theta": reading.theta.tolist(),
-                "predicted": [x if np.isfinite(x) else None for x in predicted.tolist()],
-                "std_error": reading.std_error.tolist(),
-            }  # fmt: skip
-        self._live.send(message)
-        for change in identifier.changes[self._marks :]:
-            label = f"step change, detected at {change.flagged:.2f} s"
-            mark = {"t": change.onset, "label": label, "kind": "payload"}
-            self._live.send({"mark": mark})
-        self._marks = len(identifier.changes)
-
-
 def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", metavar="URDF")
     parser.add_argument("logs", nargs=1, metavar="LOG")
     add_out(parser, "robotid-track")
     add_shown(parser, "verbose", json="print track.json")
     JOB.add(parser.add_argument_group("the log"), ONLINE)
-    words = "show the run in the browser, in real time"
-    parser.add_argument("--serve", nargs="?", const=0, type=int, metavar="PORT", help=words)
-    words = "speed of --serve, relative to real time; 0: as fast as possible; default: 1"
-    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help=words)
 
 
 def run(options: argparse.Namespace) -> None:
-    job = job_from_flags(options)
-
-    def finished(found: dict[str, Any]) -> None:
-        show_found(found, options, _show, [found["history"], "track.json"])
-        sys.stdout.flush()
-
-    def announce(url: str) -> None:
-        print(f"live: {url}  (stop with Ctrl-C)", file=sys.stderr, flush=True)
-
-    if options.serve is None:
-        finished(run_track(job, options.out))
-        return
-    try:
-        serve_track(job, options.out, port=options.serve, speed=options.speed, announce=announce,
-                    finished=finished)  # fmt: skip
-    except Terminated:
-        raise
-    except KeyboardInterrupt:
-        print("\nstopped", file=sys.stderr)
+    content = run_track(job_from_flags(options), options.out)
+    show_found(content, options, _show, [content["history"], "track.json"])
 
 
 def _show(found: dict[str, Any]) -> None:

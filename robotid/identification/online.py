@@ -6,7 +6,6 @@ filtered position, with a delay of one step. Innovations show noise, convergence
 """
 
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import overload
 
@@ -28,7 +27,6 @@ from robotid.robot.prior import prior_spread
 
 #: One instant of smooth motion: t [s], then q, v, a, tau, each of shape (n,).
 Instant = tuple[float, Array, Array, Array, Array]
-Observer = Callable[[int, "OnlineIdentifier"], None]
 
 _SLOWEST = 1e-5  # smallest cut-off over the rate
 _GAP_CYCLES = 0.25  # longest pause without a gap [periods of the cut-off]
@@ -434,15 +432,6 @@ class OnlineIdentifier:
         )
 
     @property
-    def compared(self) -> tuple[Array, Array]:
-        """Measured and predicted torque at the time of the reading, shape (n,) each.
-
-        The prediction is NaN where a joint is at rest, since its friction has no sign.
-        """
-        self._require_ready()
-        return self._compared
-
-    @property
     def estimate(self) -> Estimate:
         """The estimate in the form of the batch estimators."""
         kalman = self._require_ready()
@@ -533,7 +522,6 @@ class OnlineIdentifier:
             self._recent.append((t, self._state))
         self._state, self._t = state, t
         residual = tau - Y @ state.theta
-        self._compared = tau, np.where(used, tau - residual, np.nan)
         onset = self._innovations.push(t, tau, e, residual, uncertainty, used, self._share)
         if onset is not None:
             self._reopen(now, onset)
@@ -569,17 +557,13 @@ class Track:
         return table
 
 
-def track(
-    model: RobotModel, log: Log, settings: OnlineSettings, *, observer: Observer | None = None
-) -> Track:
+def track(model: RobotModel, log: Log, settings: OnlineSettings) -> Track:
     """Run an online identification over a log, sample by sample."""
     identifier = OnlineIdentifier(model, settings)
     times: list[float] = []
     readings: list[Reading] = []
     for k, t in enumerate(log.t.tolist()):
         identifier.update(t, log.q[k], log.tau[k])
-        if observer is not None:
-            observer(k, identifier)
         is_due = not times or t > times[-1] + 0.999 / _ROWS
         if identifier.is_ready and (is_due or k == len(log.t) - 1):
             times.append(t)

@@ -14,8 +14,16 @@ from robotid.base.typing import Array, ProgressCallback, ignore_progress
 from robotid.base.versions import __version__
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.output.pages.charts import Chart, Series, chart_html
-from robotid.output.pages.html import block, listing, number, page, text
+from robotid.output.pages.html import (
+    Chart,
+    Series,
+    block,
+    chart_html,
+    listing,
+    number,
+    page,
+    text,
+)
 from robotid.output.viewer.replays import Torques, replay
 from robotid.paper.planar_2r import urdf_text
 from robotid.paper.procedure import LoopSettings

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -98,13 +97,3 @@ def test_pipes_and_folders_are_no_input(log, tmp_path, capsys, command):
     }
     assert main([command, *words[command]]) in (1, 2)
     assert "is a pipe or a device, wanted a" in capsys.readouterr().err
-
-
-def test_a_signal_ends_the_live_page(log, tmp_path):
-    words = [sys.executable, "-m", "robotid", "track", URDF, log, "--out", str(tmp_path)]
-    run = subprocess.Popen([*words, "--serve"], stderr=subprocess.PIPE, text=True)
-    assert run.stderr.readline().startswith("live: http://127.0.0.1:")
-    run.send_signal(signal.SIGTERM)
-    assert run.communicate(timeout=60)[1] == "robotid: interrupted\n"
-    assert run.returncode == 143
-    assert list(tmp_path.iterdir()) == []

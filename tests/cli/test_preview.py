@@ -67,6 +67,9 @@ def test_a_motion_without_torques_is_previewed(files, ur5, capsys):
     white = json.loads(asked(capsys, files / "log_motion.csv", "--correlation", "0", "--json"))
     slow = json.loads(asked(capsys, files / "log_motion.csv", "--json"))
     assert sum(base(white).values()) < sum(base(slow).values())
+    motions = [files / "log_motion.csv", files / "other_motion.csv"]
+    both = json.loads(asked(capsys, *motions, "--json"))
+    assert [motion["path"] for motion in both["motions"]] == list(map(str, motions))
 
 
 def test_a_run_before_says_what_gains_most(files, capsys):

@@ -118,22 +118,6 @@ def test_the_urdf_with_drives_is_rnea_and_drive_terms(identified, monkeypatch):
         np.testing.assert_allclose(found[used], wanted, atol=np.ptp(wanted) / 60_000)
 
 
-def test_torque_that_the_result_does_not_explain_is_marked(folder):
-    header, *rows = (folder / "log.csv").read_text().splitlines()
-    pushed = header.split(",").index("tau_elbow_joint")
-    table = [row.split(",") for row in rows]
-    for cells in table[700:740]:  # from 7 s to 7.4 s
-        cells[pushed] = str(float(cells[pushed]) + 30.0)
-    text = "\n".join([header, *(",".join(cells) for cells in table)])
-    (folder / "pushed.csv").write_text(text + "\n")
-    (mark,) = run(folder, folder / "pushed.csv", folder / "out")[1]["marks"]
-    assert mark["kind"] == "contact"
-    assert mark["t"] == pytest.approx(7.0, abs=0.15)
-    assert mark["label"].startswith("unexplained torque, largest at elbow_joint (")
-    assert re.search(r"\(mean \S+ N m, for ", mark["label"])
-    assert run(folder, folder / "log.csv", folder / "out")[1]["marks"] == []
-
-
 def test_a_track_gives_parameters_over_time_and_marks_the_load(panda, tmp_path, capsys):
     log = payload_log(panda, np.random.default_rng(0), duration=12.0, at=10.0)
     write_log(log, tmp_path / "log.csv")

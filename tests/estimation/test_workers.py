@@ -189,6 +189,10 @@ def test_a_script_needs_no_guard_and_its_workers_end_with_it(tmp_path):
 
 
 def test_workers_with_another_robotid_are_refused(scheduler, tmp_path, monkeypatch):
+    from distributed import Client
+
+    with Client(scheduler, set_as_default=False) as client:
+        client.wait_for_workers(1, timeout=120)  # those of tests before are started again
     monkeypatch.setattr("robotid.base.versions.__version__", "99.0.0")
     with pytest.raises(WorkerError, match=r"workers must run robotid 99.0.0, but .* has 0\."):
         list(WorkPlan(2, scheduler).map(reduce_piece, pieces_in(tmp_path / "marks", 2), "reducing"))

@@ -418,7 +418,7 @@ def run_job_file(text, folder):
 
 flags = any_of(
     "--rate --cutoff --friction --joints --lock --gain --ignore --estimator --time-unit "
-    "--angle-unit --topic --effort --stamp --workers --serve --speed --json"
+    "--angle-unit --topic --effort --stamp --workers --json"
 )
 arguments = st.just("") | any_of(
     "x 0 -1 1 nan inf 1e308 1e-308 99999 false joint_1=nan joint_1=1e308 joint_1 joint_1,joint_1 "
@@ -435,8 +435,6 @@ def run_flags(example, folder):
     path, out = folder / "fit.csv", folder / "out"
     write_log(good_log(200), path)
     flat = [word for pair in given for word in pair[: 1 if pair[0] == "--json" else 2]]
-    if command == "track" and "--serve" in flat:
-        flat += ["--serve", "-5"]  # so that it ends
     own = {"convert": [path, folder / "out.csv"]}.get(command, [URDF, path])
     written = ["--out", out] if command in ("identify", "track") else []
     obey(command, *own, *written, *flat, out=out)

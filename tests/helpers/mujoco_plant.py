@@ -11,8 +11,8 @@ from mujoco import rollout
 
 from helpers.paths import URDF
 from robotid.data.log import Log
-from robotid.output.files.commanded import CommandedDrive
 from robotid.output.files.mjcf import write_mjcf
+from robotid.output.files.result_file import CommandedDrive
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

@@ -10,13 +10,11 @@ segments are held out in turn, and the means of the bins in the other segments p
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import sentence_of
@@ -157,12 +155,6 @@ class JointTorque:
         """Names of the parts that are more than rounding in any row."""
         least = ROUNDING * float(np.abs(self.tau).max())
         return tuple(name for name, x in self.parts.items() if np.abs(x).max() > least)
-
-    @property
-    def power(self) -> Array | None:
-        """Mechanical power tau v, shape (N,) [W]; None without a speed."""
-        speed = self.quantities.get("speed")
-        return None if speed is None else self.tau * speed[1]
 
     @property
     def rms(self) -> dict[str, float]:
@@ -437,37 +429,6 @@ def even_bins(x: Array) -> Array:
     """Return the bin of each value: ten bins with equal numbers of samples, also split at 0."""
     edges = np.unique(np.append(np.quantile(x, np.arange(1, _BINS) / _BINS), 0.0))
     return np.unique(np.searchsorted(edges, x, side="right"), return_inverse=True)[1]
-
-
-def spectrum(
-    x: Array, used: NDArray[np.bool_], segment: Array, dt: float, *, length: float = 5.0
-) -> tuple[Array, Array]:
-    """Return the power spectral density of a signal with gaps and excluded samples.
-
-    Welch's mean over half-overlapping Hann windows w, none of them across a gap. Excluded samples
-    count as zero, and a window is normalised by its used samples:
-    S(f) = 2 dt sum |FFT(w m x)|^2 / sum w^2 m, with m = 1 where a sample is used.
-
-    References:
-    Welch (1967), The use of fast Fourier transform for the estimation of power spectra.
-    Parzen (1963), On spectral analysis with missing observations.
-    """
-    bounds = np.flatnonzero(np.r_[True, np.diff(segment) != 0, True])
-    size = min(max(round(length / dt), 8), int(np.diff(bounds).max()))
-    window = np.hanning(size + 2)[1:-1]  # without the zeros at its ends
-    power, weight = np.zeros(size // 2 + 1), 0.0
-    for start, end in itertools.pairwise(bounds):
-        for first in range(int(start), int(end) - size + 1, max(size // 2, 1)):
-            masked = window * used[first : first + size]
-            power += np.abs(np.fft.rfft(masked * x[first : first + size])) ** 2
-            weight += float(np.sum(masked**2))
-    if weight == 0.0:
-        return np.empty(0), np.empty(0)
-    density = 2.0 * dt * power / weight
-    density[0] /= 2.0
-    if size % 2 == 0:
-        density[-1] /= 2.0
-    return np.fft.rfftfreq(size, dt), density
 
 
 def friction_split(model: RobotModel, evaluation: Evaluation, pi: Array) -> tuple[Array, Array]:

@@ -32,9 +32,7 @@ _EXTENT = ("samples", "rate", "start", "end", "rows_used", "segments")
 
 
 def build_result(
-    found: Identification,
-    settings: Mapping[str, Any],
-    outputs: Mapping[str, str] | None = None,
+    found: Identification, settings: Mapping[str, Any], outputs: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
     """Return the content of result.json: plain values, all numbers finite."""
     model, (bodies, drives) = found.model, parameter_entries(found)
@@ -117,10 +115,7 @@ def _left_out(found: TorqueIdentification) -> dict[str, Any]:
 
 
 def _variation(found: TorqueIdentification) -> dict[str, Any]:
-    """Return the variation between three or more logs, with the torque error of the next log.
-
-    Sums over the rows of each log are those to which the next logs are added.
-    """
+    """Return the variation between three or more logs, the next one's torque error, and sums."""
     if found.variation is None or found.sums is None:
         return {}
     rows = zip(found.model.row_names, next_errors(found).tolist(), strict=True)
@@ -214,7 +209,6 @@ def _determined(found: TorqueIdentification) -> dict[str, Any]:
 
 
 def _without_value(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a parameter's entry without the keys that require data."""
     return {key: x for key, x in entry.items() if key not in ("value", "at_bound")}
 
 
@@ -307,7 +301,6 @@ def _consistency(found: Identified) -> dict[str, Any]:
 
 
 def _band(identification: TorqueIdentification, evaluation: Evaluation) -> dict[str, Any]:
-    """Return the 95 % band of the predicted torque: its half width, and its coverage."""
     recording, band = evaluation.recording, identification.band(evaluation)
     covered = band.coverage(
         recording.trajectory.tau, evaluation.torques["estimate"], recording.mask
@@ -410,7 +403,6 @@ def _covariance(found: "PositionIdentification") -> dict[str, Any]:
 
 
 def _controller(found: "PositionIdentification") -> dict[str, Any]:
-    """Return kind, torque limits and sampling rate of the controller."""
     limits = dict(zip(found.model.joints, found.fit.loops.limit.tolist(), strict=True))
     stated = {joint: x for joint, x in limits.items() if math.isfinite(x)} or None
     return {"kind": found.loop.kind, "effort_limit": stated, "rate": found.loop.rate}

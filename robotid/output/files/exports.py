@@ -16,8 +16,7 @@ from robotid.base.findings import listed
 from robotid.base.text import yaml_name, yaml_plain
 from robotid.base.typing import Array
 from robotid.dynamics.friction_projection import Projection, project_friction
-from robotid.output.files.commanded import CommandedDrive, commanded_drives
-from robotid.output.files.result_file import Result
+from robotid.output.files.result_file import CommandedDrive, Result, commanded_drives
 from robotid.output.files.urdf import DYNAMICS_TERMS, write_urdf
 from robotid.robot.model import RobotModel
 
@@ -142,10 +141,7 @@ class Written:
 def unstated_terms(
     model: RobotModel, pi: Array, name: str, terms: Collection[str], *, has_couplings: bool = False
 ) -> list[str]:
-    """Return a sentence on drive parameters and loops that a format cannot state, if any.
-
-    pi (p,).
-    """
+    """Return a sentence on drive parameters and loops that a format cannot state: pi (p,)."""
     layout = model.layout
     drives = zip(layout.drive_parameters, layout.drive_names, pi[layout.n_inertial :], strict=True)
     missing = [

@@ -10,9 +10,7 @@ from typing import Any
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import write_text
 from robotid.base.findings import listed
-from robotid.base.typing import Array
 from robotid.base.versions import __version__
-from robotid.output.files.commanded import CommandedDrive, limit_of
 from robotid.output.files.exports import (
     Exported,
     Format,
@@ -22,13 +20,12 @@ from robotid.output.files.exports import (
     unstated_terms,
     yaml_text,
 )
-from robotid.output.files.result_file import Result
+from robotid.output.files.result_file import CommandedDrive, Result, limit_of
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint
 
 # drive terms of Isaac Lab's actuators; a note of its own states the offset
 _TERMS = ("armature", "viscous", "coulomb", "offset")
-_STEP = 0.005  # [s]
 FORMAT = Format(
     "isaac",
     "YAML of Isaac Lab's actuators",
@@ -38,10 +35,20 @@ FORMAT = Format(
 )
 
 
-def export(result: Result, target: Path, *, step: float = _STEP) -> Written:
+def export(result: Result, target: Path, *, step: float = 0.005) -> Written:
     """Write the drives of a result as the YAML of Isaac Lab's actuators."""
     of = Exported.of(result, _TERMS)
-    notes = write_isaac(of.model, of.pi, of.commanded, target, step=step, notes=of.notes)
+    content = isaac_actuators(of.model, of.commanded, step)
+    notes = [*of.notes, *unstated_terms(of.model, of.pi, "Isaac Lab", _TERMS)]
+    for key, words, remedy in (
+        ("offset", "the torque offset", "subtract it from the effort target"),
+        ("zero", "the encoder's zero", "the simulator's position is the encoder's plus the zero"),
+    ):
+        values = [f"{drive.joint} {x:.4g}" for drive in of.commanded if (x := getattr(drive, key))]
+        if values:
+            notes.append(f"Isaac Lab cannot state {words} ({listed(values)}); {remedy}")
+    head = head_of("isaac", robot=json.dumps(of.model.name), version=__version__, file=target.name)
+    write_text(yaml_text(content, "\n".join([head, *notes])), target)
     return of.written(target, notes=notes)
 
 
@@ -69,34 +76,7 @@ def isaac_actuators(
     return {"physics_dt": physics_dt, "actuators": actuators}
 
 
-def write_isaac(
-    model: RobotModel,
-    pi: Array,
-    commanded: Sequence[CommandedDrive],
-    target: str | Path,
-    *,
-    step: float = _STEP,
-    notes: Sequence[str] = (),
-) -> tuple[str, ...]:
-    """Write drives with position controllers as the YAML of Isaac Lab's actuators: pi (p,)."""
-    content = isaac_actuators(model, commanded, step)
-    every = [*notes, *unstated_terms(model, pi, "Isaac Lab", _TERMS)]
-    for key, words, remedy in (
-        ("offset", "the torque offset", "subtract it from the effort target"),
-        ("zero", "the encoder's zero", "the simulator's position is the encoder's plus the zero"),
-    ):
-        values = [f"{drive.joint} {x:.4g}" for drive in commanded if (x := getattr(drive, key))]
-        if values:
-            every.append(f"Isaac Lab cannot state {words} ({listed(values)}); {remedy}")
-    head = head_of(
-        "isaac", robot=json.dumps(model.name), version=__version__, file=Path(target).name
-    )
-    write_text(yaml_text(content, "\n".join([head, *every]) if every else head), target)
-    return tuple(every)
-
-
 def _fields(drive: CommandedDrive, joint: Joint, physics_dt: float) -> dict[str, Any]:
-    """Return the fields of one joint's actuator without its name."""
     steps = round(drive.delay / physics_dt)
     return {
         "effort_limit": _limit(limit_of(drive, joint)),

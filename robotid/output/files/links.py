@@ -15,7 +15,7 @@ from robotid.base.settings import require_kind
 from robotid.base.typing import Array
 from robotid.base.versions import __version__
 from robotid.output.files.exports import unstated_terms
-from robotid.output.files.urdf import link_parameters
+from robotid.output.files.urdf import ROUNDING, link_parameters
 from robotid.robot.bodies import inertial_parameters, link_places
 from robotid.robot.geometry import Shape, find_mesh, read_shapes
 from robotid.robot.model import RobotModel
@@ -25,7 +25,6 @@ from robotid.robot.tree import Joint
 #: Name of the fixed frame in simulators.
 WORLD = "world"
 _NAMED = 6  # missing meshes that are listed
-_ROUNDING = 1e-12  # a negative eigenvalue of a pseudo-inertia below this share of the largest is 0
 
 
 @dataclass(frozen=True)
@@ -36,6 +35,10 @@ class XmlFormat:
     terms: Collection[str]  # drive terms of a joint that it can state
     has_couplings: bool  # whether it can state them for drives that move several joints, and loops
     is_readable: Callable[[Path], bool]  # whether the simulator reads a mesh
+
+
+#: Shapes of a link: "visual" or "collision", the shape, its pose in the link, path of the mesh.
+_Shapes = Sequence[tuple[str, Shape, Array, Path | None]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +56,7 @@ class SimulatedLink:
     # its inertial parameters, shape (10,); None if it has none, as a link whose inertia is
     # included in that of the link that it is fixed to
     inertial: Array | None
-    # its shapes of the kinds "visual" and "collision": kind, shape, pose in the link's frame,
-    # path of the mesh
-    shapes: Sequence[tuple[str, Shape, Array, Path | None]]
+    shapes: _Shapes
 
 
 def write_model(
@@ -97,9 +98,7 @@ def own_drives(model: RobotModel, values: Mapping[str, float]) -> dict[str, floa
 
 
 def _links(
-    model: RobotModel,
-    inertials: dict[str, Array],
-    shapes: dict[str, list[tuple[str, Shape, Array, Path | None]]],
+    model: RobotModel, inertials: Mapping[str, Array], shapes: Mapping[str, _Shapes]
 ) -> list[SimulatedLink]:
     """Return the links, parents first; a root link named "world" is the world itself."""
     arriving = {joint.child: joint for joint in model.tree.joints}
@@ -126,7 +125,6 @@ def _links(
 
 
 def _leader(model: RobotModel, joint: Joint) -> tuple[str, float, float]:
-    """Return the joint that a mimic joint follows, the ratio and the offset."""
     row = model.pin_model.joints[model.pin_model.getJointId(joint.name)].idx_v
     ratios = model.velocity_map[row, -len(model.joints) :]
     leader = int(np.abs(ratios).argmax())
@@ -134,7 +132,6 @@ def _leader(model: RobotModel, joint: Joint) -> tuple[str, float, float]:
 
 
 def _pose(joint: Joint, position: float) -> Array:
-    """Return the pose of a joint's child in its parent."""
     R, axis = Rotation.from_euler("xyz", joint.rpy), np.array(joint.axis)
     displacement = position * axis / np.linalg.norm(axis)
     if joint.type == "prismatic":
@@ -151,7 +148,7 @@ def _inertials(model: RobotModel, pi: Array) -> dict[str, Array]:
             continue
         values = inertial_parameters(stated)
         eigenvalues = np.linalg.eigvalsh(pseudo_inertia(values)[0])
-        if eigenvalues[0] >= -_ROUNDING * abs(eigenvalues[-1]) and values[0] > 0:
+        if eigenvalues[0] >= -ROUNDING * abs(eigenvalues[-1]) and values[0] > 0:
             found[place.link] = values
         elif place.body >= 0 and values.any():  # a link fixed to the world has no effect
             raise ModelError(
@@ -163,7 +160,7 @@ def _inertials(model: RobotModel, pi: Array) -> dict[str, Array]:
 
 def _shapes(
     model: RobotModel, to: XmlFormat, urdfs: Sequence[str | Path], left_out: set[str]
-) -> dict[str, list[tuple[str, Shape, Array, Path | None]]]:
+) -> Mapping[str, _Shapes]:
     """Return the shapes of each link, and add the URDF's names of unusable meshes to a set."""
     found: dict[str, list[tuple[str, Shape, Array, Path | None]]] = {}
     for tag in ("visual", "collision"):

@@ -14,10 +14,9 @@ from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
 from robotid.base.settings import require_each, require_kind
 from robotid.base.typing import Array
-from robotid.output.files.commanded import CommandedDrive, limit_of
 from robotid.output.files.exports import Exported, Format, Option, Written
 from robotid.output.files.links import WORLD, SimulatedLink, XmlFormat, own_drives, write_model
-from robotid.output.files.result_file import Result
+from robotid.output.files.result_file import CommandedDrive, Result, limit_of
 from robotid.output.files.urdf import numbers_text
 from robotid.robot.bodies import principal_moments
 from robotid.robot.model import RobotModel
@@ -67,12 +66,10 @@ _COMPILER = {
     "boundmass": "0", "boundinertia": "0",
 }  # fmt: skip
 _MOST_FACES = 200_000  # of a mesh that MuJoCo reads
-_STEP = 0.001  # [s]
-_EXACT = 1e-9  # of a step: a delay so close to whole steps is rounded to them
 _STL_HEAD, _STL_FACE = 84, 50  # bytes; MuJoCo does not read STL in text form
 
 
-def export(result: Result, target: Path, *, step: float = _STEP, delay: str = "history") -> Written:
+def export(result: Result, target: Path, *, step: float = 0.001, delay: str = "history") -> Written:
     """Write a result as MJCF."""
     of = Exported.of(result, _TERMS)
     notes = write_mjcf(
@@ -84,15 +81,15 @@ def export(result: Result, target: Path, *, step: float = _STEP, delay: str = "h
 
 @dataclass(frozen=True)
 class _Servos:
-    """The joints with position controllers, by name, and the model of their delay.
+    """The joints with position controllers.
 
     A step changes v by the force at its start and then q by the new v, so that a force acts half a
     step early. Commands are therefore read half a step later, with linear interpolation.
     """
 
-    of: Mapping[str, CommandedDrive]
-    step: float
-    delay: str
+    of: Mapping[str, CommandedDrive]  # by joint
+    step: float  # [s]
+    delay: str  # model of the delay, one of DELAYS
 
     @property
     def notes(self) -> list[str]:
@@ -131,23 +128,23 @@ class _Servos:
             at |= {"dyntype": "filterexact", "dynprm": numbers_text([drive.delay, 0.0, 0.0])}
         elif drive.delay:
             delay = max(drive.delay + 0.5 * self.step, self.step)  # MuJoCo's minimum is a step
-            samples = str(math.ceil(delay / self.step - _EXACT))
+            samples = str(math.ceil(round(delay / self.step, 9)))
             at |= {"delay": numbers_text([delay]), "nsample": samples, "interp": "linear"}
         return at
 
 
 def write_mjcf(
     model: RobotModel,
-    pi: Array,
+    pi: Array,  # (p,)
     target: str | Path,
     *,
-    original: str | Path | None = None,
-    commanded: Sequence[CommandedDrive] = (),
-    step: float = _STEP,
+    original: str | Path | None = None,  # a further URDF to which paths of meshes may be relative
+    commanded: Sequence[CommandedDrive] = (),  # with the friction of pi
+    step: float = 0.001,  # [s]
     delay: str = "history",
     notes: Sequence[str] = (),
 ) -> tuple[str, ...]:
-    """Write standard parameters as an MJCF file.
+    """Write standard parameters as an MJCF file; return what it does not state, as in its head.
 
     Every link is a body. The inertial of a moving link includes those of all links fixed to it.
     Armature, viscous and Coulomb friction are the joint's armature, damping and frictionloss, or
@@ -159,24 +156,6 @@ def write_mjcf(
     The control of a joint with a position controller is its position command. Its delay is a
     history of commands, which needs MuJoCo 3.5, or a first-order filter with the same delay at low
     frequencies. The position of such a joint is the reading of its encoder (``ref``).
-
-    Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
-        target: The file to write.
-        original: A further URDF to which paths of meshes may be relative.
-        commanded: The joints with position controllers, with the friction of pi.
-        step: Time step in the file if there are position controllers [s].
-        delay: Model of the command delay, "history" or "filter".
-        notes: Further notes on the file.
-
-    Returns:
-        Properties that the file does not state, a sentence each; its head has them, too.
-
-    Raises:
-        DataError: If pi does not have p finite entries, or the folder does not exist.
-        ModelError: If a link or a drive would be physically impossible.
-        SettingsError: If the target is a folder, step is not positive, or delay is neither.
     """
     require_kind(model, RobotModel, "model", "a robotid.RobotModel")
     require_kind(step, (float, int), "step", "a time [s]")
@@ -187,10 +166,8 @@ def write_mjcf(
         raise SettingsError(f"step is {step:g} s, wanted a positive time")
     if delay not in DELAYS:
         raise SettingsError(f"delay is {delay!r}, wanted one of {listed(DELAYS)}")
-    to, servos = (
-        XmlFormat("MJCF", _TERMS, True, _is_readable),
-        _Servos({drive.joint: drive for drive in commanded}, step, delay),
-    )
+    to = XmlFormat("MJCF", _TERMS, True, _is_readable)
+    servos = _Servos({drive.joint: drive for drive in commanded}, step, delay)
     build = partial(_mjcf, model, servos)
     return write_model(model, pi, target, original, to, build, [*notes, *servos.notes])
 
@@ -207,10 +184,7 @@ def _is_readable(mesh: Path) -> bool:
 
 
 def _mjcf(
-    model: RobotModel,
-    servos: _Servos,
-    links: Sequence[SimulatedLink],
-    values: Mapping[str, float],
+    model: RobotModel, servos: _Servos, links: Sequence[SimulatedLink], values: Mapping[str, float]
 ) -> ET.Element:
     top = ET.Element("mujoco", model=model.name)
     ET.SubElement(top, "compiler", _COMPILER)
@@ -237,7 +211,6 @@ def _mjcf(
 def _add_motion(
     body: ET.Element, link: SimulatedLink, values: Mapping[str, float], servos: _Servos
 ) -> None:
-    """Add the inertial of a link, and the joint that moves it."""
     if link.inertial is not None:
         moments, axes = principal_moments(link.inertial)
         x, y, z = np.maximum(moments, 0.0)  # their sums are possible moments in any rounding
@@ -284,7 +257,6 @@ def _add_drives(
     values: Mapping[str, float],
     servos: _Servos,
 ) -> None:
-    """Add drives of several joints as tendons, joints that follow others, and actuators."""
     tendons, equality, actuators = (
         ET.SubElement(top, tag) for tag in ("tendon", "equality", "actuator")
     )
@@ -331,7 +303,6 @@ def _add_loops(top: ET.Element, model: RobotModel, bodies: Mapping[str, ET.Eleme
 
 
 def _drive(name: str, values: Mapping[str, float]) -> dict[str, str]:
-    """Return the attributes that state the terms of a drive."""
     stated = {key: values.get(f"{name}.{term}") for term, key in _ATTRIBUTES.items()}
     return {key: numbers_text([value]) for key, value in stated.items() if value is not None}
 

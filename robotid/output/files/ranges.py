@@ -27,15 +27,19 @@ from robotid.estimation.variation.spread import (
     scores_to_values,
 )
 from robotid.estimation.variation.variation import SCORES
-from robotid.output.files.commanded import commanded_drives
 from robotid.output.files.exports import Format, Option, Written, head_of, yaml_text
-from robotid.output.files.result_file import Result
+from robotid.output.files.result_file import Result, commanded_drives
 from robotid.output.files.urdf import link_parameters
 from robotid.robot.bodies import held_parameters, principal_moments
 from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia, pseudo_inertia_basis
 
+_DIGITS = 9  # significant digits of the root in result.json
+_MOST = 1_000_000
+#: Drive terms of simulators, which replace the friction of drives with further terms.
+SIMULATED = ("viscous", "coulomb", "offset")
+_POSITIVE = ("kp", "limit")
 #: Parameters of drives that cannot be negative.
 _NOT_NEGATIVE = {"kd", "delay", *(name for name, term in TERMS.items() if term.is_nonnegative)}
 FORMAT = Format(
@@ -53,11 +57,7 @@ FORMAT = Format(
 
 
 def export(
-    result: Result,
-    target: Path,
-    *,
-    samples: int | None = None,
-    seed: int | None = None,
+    result: Result, target: Path, *, samples: int | None = None, seed: int | None = None
 ) -> Written:
     """Write the ranges that a result states, as YAML, and samples beside it, as JSON."""
     if samples is None and seed is not None:
@@ -75,51 +75,33 @@ def export(
 
 
 def parameter_ranges(found: Identified) -> dict[str, Any]:
-    """Return the ranges of the parameters of links and drives, as plain values.
-
-    The intervals of centre and moments are first-order functions of those of the parameters.
-    """
-    layout, sources = found.model.layout, found.sources
-    errors, covariance = found.standard_error, found.standard_covariance
-    quantile = found.standard_quantile
+    """Return the ranges of links and drives as plain values, to first order in the parameters."""
+    layout, sources, quantile = found.model.layout, found.sources, found.standard_quantile
     variation = getattr(found, "variation", None)  # not of a result from commands
-    between = {} if variation is None else {each.name: each for each in variation.parameters}
+    between = {} if variation is None else {x.name: x.prediction for x in variation.parameters}
     drives: dict[str, dict[str, Any]] = {drive.name: {} for drive in layout.drives}
-    for k, (d, term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
-        name, least = layout.drives[d].name, 0.0 if term.is_nonnegative else -math.inf
+    for k, (d, drive_term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
+        name, drive = layout.names[k], layout.drives[d].name
+        least = 0.0 if drive_term.is_nonnegative else -math.inf
         source = "bound" if found.at_bound[k] else sources[k]
-        found_range = _range(
-            found.standard[k], errors[k], source, least=least, quantile=float(quantile[k])
-        )
-        if layout.names[k] in between and source != "bound":
-            low, high = between[layout.names[k]].prediction.ends
-            found_range |= {"low": max(float(low), least), "high": float(high), "source": "logs"}
-        term_name = layout.names[k].removeprefix(f"{name}.")
-        drives[name][term_name] = found_range | {"unit": layout.units[k]}
+        error, reach = found.standard_error[k], float(quantile[k])
+        ends = _range(found.standard[k], error, source, reach, least)
+        if name in between and source != "bound":
+            ends = _of_logs(ends, between[name].ends, least)
+        drives[drive][name.removeprefix(f"{drive}.")] = ends | {"unit": layout.units[k]}
+    bodies = {}
+    for i, (body, pi) in enumerate(link_parameters(found.model, found.standard).items()):
+        part = slice(10 * i, 10 * i + 10)
+        C = found.standard_covariance[part, part]
+        bodies[body] = _body(pi, C, sources[part], float(quantile[part].max()))
     return {
         "robot": found.model.name,
         "confidence": 0.95,
-        "bodies": body_ranges(found.model, found.standard, covariance, sources, quantile),
+        "bodies": bodies,
         "drives": drives,
         **projected_ranges(found),
         "undetermined": list(found.undetermined),
     }
-
-
-def body_ranges(
-    model: RobotModel, standard: Array, covariance: Array, sources: Sequence[str], quantile: Array
-) -> dict[str, dict[str, Any]]:
-    """Return the ranges of links; a link that was not identified has no ends.
-
-    standard (p,), covariance (p, p), quantile (p,).
-    """
-    own, bodies = link_parameters(model, standard), {}
-    for i, body in enumerate(model.layout.bodies):
-        part = slice(10 * i, 10 * i + 10)
-        bodies[body] = _body(
-            own[body], covariance[part, part], sources[part], float(quantile[part].max())
-        )
-    return bodies
 
 
 def projected_ranges(found: Identified) -> dict[str, Any]:
@@ -132,13 +114,7 @@ def projected_ranges(found: Identified) -> dict[str, Any]:
         errors = np.sqrt(np.maximum(np.diag(drive.transfer @ C @ drive.transfer.T), 0.0))
         quantile = float(found.standard_quantile[list(drive.own)].max())
         ranges[drive.name] = {
-            term: _range(
-                value,
-                error,
-                "data",
-                quantile=quantile,
-                least=0.0 if term in _NOT_NEGATIVE else -math.inf,
-            )
+            term: _range(value, error, "data", quantile, _least(term))
             for (term, value), error in zip(drive.values.items(), errors, strict=True)
             if error > 0
         }
@@ -147,31 +123,23 @@ def projected_ranges(found: Identified) -> dict[str, Any]:
 
 def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return the ranges of a result, including gains, delays and zeros of its drives."""
+    empty = {"robot": content["robot"], "confidence": 0.95, "bodies": {}, "drives": {}}
+    ranges = content.get("ranges", empty)
+    between = content.get("variation", {}).get("parameters", {})
     drives: dict[str, dict[str, Any]] = {}
     for entry in content["drive_parameters"]:
         drive, _, term = entry["name"].rpartition(".")
         error = entry.get("std_error")
+        reach = entry.get("quantile") or QUANTILE
         ends = _range(
-            entry["value"],
-            math.inf if error is None else error,
-            source_of(entry),
-            is_positive=term == "kp",
-            quantile=entry.get("quantile") or QUANTILE,
-            least=0.0 if term in _NOT_NEGATIVE else -math.inf,
-        )
-        drives.setdefault(drive, {})[term] = ends | {"unit": entry["unit"]}
-    empty = {"robot": content["robot"], "confidence": 0.95, "bodies": {}, "drives": {}}
-    ranges = content.get("ranges", empty)
-    merged = {drive: terms | ranges["drives"].get(drive, {}) for drive, terms in drives.items()}
-    for name, entry in content.get("variation", {}).get("parameters", {}).items():
-        drive, _, term = name.rpartition(".")
-        own = merged.get(drive, {}).get(term)
-        if own is not None and "low" in own and own["source"] != "bound":
-            low, high = entry["next_interval"]
-            least = 0.0 if term in _NOT_NEGATIVE or term == "kp" else -math.inf
-            of_logs = {"low": max(low, least), "high": high, "source": "logs"}
-            merged[drive][term] = own | of_logs
-    return {"undetermined": content["structure"]["undetermined"], **ranges, "drives": merged}
+            entry["value"], math.inf if error is None else error, source_of(entry), reach,
+            _least(term), is_positive=term == "kp",
+        ) | {"unit": entry["unit"]}  # fmt: skip
+        ends = ranges["drives"].get(drive, {}).get(term, ends)
+        if entry["name"] in between and "low" in ends and ends["source"] != "bound":
+            ends = _of_logs(ends, between[entry["name"]]["next_interval"], _least(term))
+        drives.setdefault(drive, {})[term] = ends
+    return {"undetermined": content["structure"]["undetermined"], **ranges, "drives": drives}
 
 
 def ranges_text(ranges: Mapping[str, Any]) -> str:
@@ -197,7 +165,7 @@ def _body(pi: Array, covariance: Array, sources: Sequence[str], quantile: float)
     origins += [_joint_source(sources)] * 6
     x, y, z, w = Rotation.from_matrix(V).as_quat()
     mass, *rest = (
-        _range(value, error, origin, is_positive=not 1 <= k <= 3, quantile=quantile)
+        _range(value, error, origin, quantile, is_positive=not 1 <= k <= 3)
         for k, (value, error, origin) in enumerate(zip(values, errors, origins, strict=True))
     )
     return {
@@ -210,7 +178,6 @@ def _body(pi: Array, covariance: Array, sources: Sequence[str], quantile: float)
 
 
 def _joint_source(sources: Sequence[str]) -> str:
-    """Return the source of a function of several parameters."""
     return sources[0] if len(set(sources)) == 1 else "mixed"
 
 
@@ -224,10 +191,10 @@ def _range(
     value: float,
     error: float,
     source: str,
+    quantile: float,
+    least: float = -math.inf,
     *,
     is_positive: bool = False,
-    least: float = -math.inf,
-    quantile: float = QUANTILE,
 ) -> dict[str, Any]:
     """Return the range of a value; without ends if its standard error is infinite."""
     nominal, half = float(value), quantile * float(error)
@@ -237,18 +204,17 @@ def _range(
     return {"nominal": nominal, "low": low, "high": nominal + half, "source": source}
 
 
-_DIGITS = 9  # significant digits of the root in result.json
-_MOST = 1_000_000
-_POSITIVE = ("kp", "limit")
-#: Drive terms of simulators, which replace the friction of drives with further terms.
-SIMULATED = ("viscous", "coulomb", "offset")
+def _of_logs(ends: Mapping[str, Any], interval: Sequence[float], least: float) -> dict[str, Any]:
+    low, high = map(float, interval)
+    return {**ends, "low": max(low, least), "high": high, "source": "logs"}
+
+
+def _least(term: str) -> float:
+    return 0.0 if term in _NOT_NEGATIVE or term == "kp" else -math.inf
 
 
 def covariance_entry(names: Sequence[str], covariance: Array, is_fixed: Array) -> dict[str, Any]:
-    """Return the covariance of parameters for result.json, as its root.
-
-    covariance (p, p), is_fixed (p,).
-    """
+    """Return a covariance (p, p) for result.json, as its root; fixed parameters (p,) have none."""
     is_known = ~(is_fixed | is_fixed[:, None]) & np.isfinite(covariance)
     L = root_of(np.where(is_known, covariance, 0.0))
     root = [[float(f"{x:.{_DIGITS}g}") for x in np.trim_zeros(row, "b")] for row in L]
@@ -284,14 +250,12 @@ def write_samples(result: Result, target: Path, count: int, seed: int) -> None:
 
 
 def sample(result: Result, count: int, rng: np.random.Generator) -> tuple[list[str], Array]:
-    """Return samples of all parameters from their joint distribution.
+    """Return samples (count, p) of all parameters from their joint distribution.
 
     Bodies are normal with the covariance of the fit, given that all are physically possible.
     Drive parameters with a spread between logs have the predictive distribution of the next log or
     robot. Their correlation is that of the error of the fit, with all its parameters, and that of
     their values in the logs, among each other.
-
-    -> (count, p).
     """
     model, pi = result.identified
     stated = result.content.get("covariance")
@@ -344,10 +308,7 @@ def sample(result: Result, count: int, rng: np.random.Generator) -> tuple[list[s
 
 
 def _positive_definite(J: Array) -> Array:
-    """Return which symmetric matrices, shape (k, n, n), are positive definite, shape (k,).
-
-    They are those whose elimination has positive pivots only.
-    """
+    """Return whether the pivots of symmetric matrices (k, n, n) are positive, shape (k,)."""
     left = np.array(J.transpose(1, 2, 0), order="C")
     found = np.ones(len(J), dtype=bool)
     for k in range(len(left)):
@@ -379,7 +340,6 @@ def _quantile(content: Mapping[str, Any]) -> float:
 
 
 def _nominal(result: Result, names: list[str]) -> list[float]:
-    """Return the identified values of gains, delays and zeros."""
     stated = {entry["name"]: float(entry["value"]) for entry in result.content["drive_parameters"]}
     return [stated[name] for name in names]
 
@@ -406,7 +366,6 @@ def _bodies(model: RobotModel, values: Array) -> dict[str, Any]:
 
 
 def _drives(model: RobotModel, names: list[str], values: Array) -> dict[str, dict[str, Any]]:
-    """Return the samples of drive terms, gains, delays and zeros, by drive."""
     found: dict[str, dict[str, Any]] = {}
     for k in range(model.layout.n_inertial, len(names)):
         drive, _, term = names[k].rpartition(".")

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,40 +18,110 @@ from robotid.base.typing import Array
 from robotid.data.log import Log, suggestion
 from robotid.diagnosis.verdict.parameter_table import parameter_table
 from robotid.diagnosis.verdict.scale_check import PayloadCheck, ScaleCheck, StatedMass
-from robotid.dynamics.friction_projection import (
-    DriveMoments,
-    projected_pinocchio_model,
-)
+from robotid.dynamics.friction_projection import DriveMoments, projected_pinocchio_model
 from robotid.dynamics.prediction import predict_instants
 from robotid.estimation.fitting.standard_errors import FrictionCurve
 from robotid.estimation.variation.groups import RunSums
 from robotid.estimation.variation.variation import between_covariance
-from robotid.output.files.commanded import (
-    CommandedDrive,
-    commanded_drives,
-    loops_of,
-)
 from robotid.output.files.shape import check_shape, require_lengths, schema
 from robotid.output.files.urdf import load_identified, terms_from_facts
 from robotid.robot.model import RobotModel
+from robotid.robot.tree import Joint
 
 if TYPE_CHECKING:
+    from robotid.dynamics.simulation.loops import Loops
     from robotid.identification.closed_loop.position_errors import PositionEvaluation
 
 SCHEMA_VERSION = 1
+#: Parameters of a joint's controller, 0 if a result lacks them.
+_OF_CONTROLLER = ("kd", "delay", "zero")
+_OF_DRIVE = ("armature", "viscous", "coulomb", "offset")
 _ROUNDING = 1e-9  # [-] of eigenvalues that may be 0
+
+
+@dataclass(frozen=True)
+class CommandedDrive:
+    """A joint whose drive has a position controller.
+
+    The torque of the controller is tau = kp (q_ref(t - delay) - q) - kd v, within +-effort_limit.
+    The torque on the bodies is tau - armature a - viscous v - coulomb sign(v) - offset. The
+    encoder reads q = q_urdf - zero.
+    """
+
+    joint: str
+    kp: float  # proportional gain [N m/rad or N/m]
+    kd: float  # derivative gain [N m s/rad or N s/m]
+    delay: float  # delay of the command [s]
+    zero: float  # position of the URDF's joint at which the encoder reads 0 [rad or m]
+    armature: float  # inertia of the rotor, reflected to the joint [kg m^2 or kg]
+    viscous: float  # viscous friction [N m s/rad or N s/m]
+    coulomb: float  # Coulomb friction [N m or N]
+    offset: float  # constant torque [N m or N]
+    effort_limit: float  # torque limit of the controller, inf if it has none [N m or N]
+
+
+def commanded_drives(
+    model: RobotModel, pi: Array, content: Mapping[str, Any], name: str
+) -> tuple[CommandedDrive, ...]:
+    """Return the drives of a result with gains, by joint; none without gains: pi (p,)."""
+    stated = {entry["name"]: float(entry["value"]) for entry in content["drive_parameters"]}
+    if not any(f"{joint}.kp" in stated for joint in model.joints):
+        return ()
+    missing = [joint for joint in model.joints if f"{joint}.kp" not in stated]
+    if missing:
+        raise DataError(
+            f"{name} has gains of some joints, but no kp of {listed(missing)}; identify again with "
+            "gains of all joints in [controller]"
+        )
+    for joint in model.joints:
+        for term, wanted, is_right in (
+            ("kp", "more than 0", stated[f"{joint}.kp"] > 0),
+            ("kd", "0 or more", stated.get(f"{joint}.kd", 0.0) >= 0),
+            ("delay", "0 or more", stated.get(f"{joint}.delay", 0.0) >= 0),
+        ):
+            if not is_right:
+                value = stated[f"{joint}.{term}"]
+                raise DataError(f"{name}: {joint}.{term} is {value:g}, wanted {wanted}")
+    controller = content.get("simulation", {}).get("controller", {})
+    efforts = controller.get("effort_limit") or {}
+    found = dict(zip(model.layout.names, pi.tolist(), strict=True))
+    return tuple(
+        CommandedDrive(
+            joint,
+            stated[f"{joint}.kp"],
+            **{key: stated.get(f"{joint}.{key}", 0.0) for key in _OF_CONTROLLER},
+            **{key: found.get(f"{joint}.{key}", 0.0) for key in _OF_DRIVE},
+            effort_limit=stated.get(f"{joint}.limit") or efforts.get(joint, np.inf),
+        )
+        for joint in model.joints
+    )
+
+
+def loops_of(
+    model: RobotModel, pi: Array, drives: Sequence[CommandedDrive], rate: float | None = None
+) -> "Loops":
+    """Return bodies, drives and controllers for simulation: pi (p,)."""
+    from robotid.dynamics.simulation.loops import open_loops
+
+    kp, kd, delay, zero, limit = (
+        np.array([getattr(drive, key) for drive in drives])
+        for key in ("kp", "kd", "delay", "zero", "effort_limit")
+    )
+    found = open_loops(model, pi)
+    return replace(found, kp=kp, kd=kd, delay=delay, zero=zero, limit=limit, rate=rate)
+
+
+def limit_of(drive: CommandedDrive, joint: Joint) -> float:
+    """Return the torque limit of a drive; the URDF's where none was stated or found, else inf."""
+    stated = joint.effort if joint.effort > 0 else np.inf
+    return drive.effort_limit if np.isfinite(drive.effort_limit) else stated
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """A written identification: result.json, with URDF and sidecar in the same folder.
+    """A written identification: result.json, with URDF and sidecar in the same folder."""
 
-    Attributes:
-        path: The result.json.
-        content: Its content.
-    """
-
-    path: Path
+    path: Path  # the result.json
     content: Mapping[str, Any]
 
     def __repr__(self) -> str:
@@ -110,17 +180,7 @@ class Result:
         return rate
 
     def follow_commands(self, log: Log) -> Array:
-        """Return the positions of the robot simulated on the commands of a log.
-
-        Args:
-            log: The log, with commands; its joints are those of the robot in the same order.
-
-        Returns:
-            Simulated encoder readings, shape (N, n) [rad or m].
-
-        Raises:
-            DataError: If the result has no gains of drives, or the log no commands.
-        """
+        """Return the encoder readings simulated on a log's commands, (N, n) [rad or m]."""
         if not self.commanded:
             raise DataError(
                 f"{self.path.name} has no gains of drives, which a simulation on commands requires"
@@ -134,17 +194,8 @@ class Result:
     ) -> "PositionEvaluation":
         """Return a log with the positions simulated for it, in the URDF's sense of the joints.
 
-        The inputs are its commands; for a result without gains, its feed-forward torques.
-
-        Args:
-            log: The log, with commands; its joints are those of the robot in the same order.
-            horizons: Horizons of errors [s]; those of result.json if None.
-
-        Raises:
-            DataError: If the result is from torques.
-            MissingDependencyError: If Numba is not installed.
-            NotConvergedError: If a step has no solution.
-            SettingsError: If a term of the drives cannot be simulated.
+        The inputs are its commands; for a result without gains, its feed-forward torques. The
+        horizons of errors [s] are those of result.json if None.
         """
         require_kind(log, Log, "log", "a robotid.Log")
         from robotid.dynamics.simulation.loops import ClosedLoopRobot, open_loops
@@ -170,30 +221,11 @@ class Result:
     def predict(
         self, q: ArrayLike, v: ArrayLike | None = None, a: ArrayLike | None = None
     ) -> Array:
-        """Return the torques that the result predicts; see ``Identification.predict``.
-
-        Args:
-            q: Positions, shape (n,) or (N, n) [rad, m].
-            v: Velocities, same shape [rad/s, m/s]; None: at rest.
-            a: Accelerations, same shape [rad/s^2, m/s^2]; None: 0.
-
-        Returns:
-            Torques, same shape [N m, N].
-
-        Raises:
-            DataError: If a shape is wrong, or the result has no URDF.
-        """
+        """Return the torques that the result predicts; see ``Identification.predict``."""
         return predict_instants(*self.identified, q, v, a)
 
     def friction(self, joint: str) -> FrictionCurve:
-        """Return friction and offset of a joint over its speed, in the range of the fitted logs.
-
-        Args:
-            joint: The joint.
-
-        Raises:
-            DataError: If the result has no friction curve of the joint.
-        """
+        """Return friction and offset of a joint over its speed, in the range of the fitted logs."""
         require_kind(joint, str, "joint", "the name of a joint")
         curves = {
             name: about["curve"]
@@ -222,11 +254,7 @@ class Result:
         return {name: DriveMoments.from_dict(table) for name, table in tables.items()}
 
     def pinocchio_model(self) -> Any:  # noqa: ANN401
-        """Return Pinocchio's model of the robot; see ``Identification.pinocchio_model``.
-
-        Raises:
-            DataError: If the result has no URDF.
-        """
+        """Return Pinocchio's model of the robot; see ``Identification.pinocchio_model``."""
         return projected_pinocchio_model(*self.identified, self.drive_moments)
 
     @property

@@ -38,32 +38,17 @@ def export(result: Result, target: Path) -> Written:
 
 def write_sdf(
     model: RobotModel,
-    pi: Array,
+    pi: Array,  # (p,)
     target: str | Path,
     *,
-    original: str | Path | None = None,
+    original: str | Path | None = None,  # a further URDF to which paths of meshes may be relative
     notes: Sequence[str] = (),
 ) -> tuple[str, ...]:
-    """Write standard parameters as an SDF file of one model.
+    """Write standard parameters as an SDF file; return what it does not state, as in its head.
 
     The inertial of a moving link includes those of all links fixed to it, which are frames. Links
     beyond locked joints have their own inertial. Viscous and Coulomb friction are the joint's
     damping and friction; the armature is Drake's rotor inertia, which Gazebo does not read.
-
-    Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
-        target: The file to write.
-        original: A further URDF to which paths of meshes may be relative.
-        notes: Further notes on the file.
-
-    Returns:
-        Properties that the file does not state, a sentence each; its head has them, too.
-
-    Raises:
-        DataError: If pi does not have p finite entries, or the folder does not exist.
-        ModelError: If a link or a drive would be physically impossible.
-        SettingsError: If the target is a folder.
     """
     require_kind(model, RobotModel, "model", "a robotid.RobotModel")
     require_kind(notes, (list, tuple), "notes", "a list of sentences")

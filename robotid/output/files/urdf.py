@@ -5,11 +5,9 @@ Only the inertials of the original file change; all other bytes are unchanged. T
 coupled drives.
 """
 
-import difflib
 import hashlib
 import json
 import math
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -44,10 +42,7 @@ from robotid.robot.tree import MOMENTS, Inertial
 #: The drive terms of ``<dynamics>``.
 DYNAMICS_TERMS = tuple(name for name, term in TERMS.items() if term.dynamics)
 _SCHEMA_VERSION = 1
-_HUNK = re.compile(r"@@ -(\d+)")
-_OWNER = re.compile(r"""<(?:link|joint)\s[^>]*?\bname\s*=\s*["']([^"']*)""")
-_UNCHANGED = 1e-12  # relative difference below which a parameter counts as unchanged
-_ROUNDING = 1e-12  # of the size of a link, below which a number is 0
+ROUNDING = 1e-12  # of the size of a parameter or a link, below which a difference is 0
 _STATES = 64  # random states at which the written file must give the same torque
 _SAME = 1e-6  # largest relative difference of a row's torque over these states
 
@@ -55,27 +50,16 @@ _SAME = 1e-6  # largest relative difference of a row's torque over these states
 def write_urdf(
     model: RobotModel, pi: Array, target: str | Path, *, dynamics: Projection | bool = False
 ) -> Path:
-    """Write standard parameters into a copy of the model's URDF, and a sidecar in the same folder.
+    """Write standard parameters into a copy of the model's URDF, and a sidecar beside it.
 
     The moving link of a body gets the inertial of the body. The inertials of links fixed to it are
     removed, because the body includes them. Links beyond locked joints are unchanged. Angles that
     the model has in exact form (``snap_angles``) are written in this form. Both files are read
     again, and must give the torque of pi, before they replace existing files.
 
-    Args:
-        model: The robot; a copy of its file is edited.
-        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
-        target: The URDF to write; not the original.
-        dynamics: Whether viscous and Coulomb friction are also written to ``<dynamics>``: those of
-            a projection, which the sidecar then states, or those of pi.
-
-    Returns:
-        Path of the sidecar, ``<target stem>.drive.json``.
-
-    Raises:
-        DataError: If pi does not have p finite entries.
-        ModelError: If a link or a drive would be physically impossible, the original is missing or
-            cannot be edited, the target is not usable, or the written file differs from pi.
+    pi (p,); ``dynamics``: whether viscous and Coulomb friction are also written to ``<dynamics>``,
+    those of pi or those of a projection, which the sidecar then states. Returns the path of the
+    sidecar, ``<target stem>.drive.json``.
     """
     require_kind(model, RobotModel, "model", "a robotid.RobotModel")
     require_kind(target, (str, Path), "target", "the path of a URDF to write")
@@ -95,35 +79,15 @@ def write_urdf(
         "urdf_sha256": _digest(content),
         "source": {"urdf": source.name, "sha256": _digest(original)},
         **_facts(model, pi, places),
-        **_projected_facts(dynamics),
     }
+    if isinstance(dynamics, Projection) and dynamics.drives:
+        facts["projected_dynamics"] = {drive.name: drive.to_dict() for drive in dynamics.drives}
     with folder_beside(goal.parent) as partial:
         (partial / goal.name).write_bytes(content)
         text = json.dumps(facts, indent=1, allow_nan=False, ensure_ascii=False)
         (partial / sidecar.name).write_text(text + "\n", encoding="utf-8")
         _check_torque(model, pi, partial / goal.name, partial / sidecar.name)
     return sidecar
-
-
-def urdf_changes(model: RobotModel, pi: Array, *, dynamics: Projection | bool = False) -> list[str]:
-    """Return the differences of the URDF of ``write_urdf`` from the original, line by line.
-
-    pi (p,).
-    """
-    source = Path(model.tree.path)
-    if not source.is_file():
-        return []
-    original, written = source.read_bytes(), link_parameters(model, pi)
-    texts = original, _content(original, model, pi, written, dynamics=dynamics)
-    before, after = (text.decode("utf-8", errors="replace").splitlines() for text in texts)
-    names = source.name, f"{source.stem}.identified.urdf"
-    lines = list(difflib.unified_diff(before, after, *names, n=0, lineterm=""))
-    for k, line in enumerate(lines):
-        if place := _HUNK.match(line):
-            around = "\n".join(before[: int(place[1])])
-            owners = _OWNER.findall(around)
-            lines[k] = f"{line} {owners[-1] if owners else ''}".rstrip()
-    return lines
 
 
 def read_sidecar(path: str | Path) -> dict[str, Any]:
@@ -186,7 +150,6 @@ def _content(
     *,
     dynamics: Projection | bool,
 ) -> bytes:
-    """Return the original URDF with new parameters of links and drives."""
     document = xml_splice.parse(original, Path(model.tree.path).name)
     changed = {
         link: pi
@@ -228,13 +191,6 @@ def _facts(model: RobotModel, pi: Array, places: Sequence[LinkPlace]) -> dict[st
     }
 
 
-def _projected_facts(dynamics: Projection | bool) -> dict[str, Any]:
-    """Return the projection of friction on ``<dynamics>``, if there is one."""
-    if not isinstance(dynamics, Projection) or not dynamics.drives:
-        return {}
-    return {"projected_dynamics": {drive.name: drive.to_dict() for drive in dynamics.drives}}
-
-
 def _lumped(model: RobotModel, places: Sequence[LinkPlace]) -> dict[str, list[str]]:
     lumped: dict[str, list[str]] = {}
     for place in places:
@@ -274,10 +230,7 @@ def _check_target(source: Path, target: Path) -> None:
 
 
 def link_parameters(model: RobotModel, pi: Array) -> dict[str, Array]:
-    """Return the ten parameters of each moving link in its frame, without locked links.
-
-    pi (p,) -> (10,).
-    """
+    """Return the ten parameters of each moving link in its frame, without locked links: pi (p,)."""
     _check_parameters(model, pi)
     layout = model.layout
     advice = "identify with the estimator 'consistent', whose bodies and drives are possible"
@@ -344,15 +297,14 @@ def _is_as_stated(parameters: Array, stated: Inertial | None) -> bool:
     if stated is None:
         return False
     before = inertial_parameters(stated)
-    return bool(np.allclose(parameters, before, rtol=_UNCHANGED, atol=_ROUNDING * before[0]))
+    return bool(np.allclose(parameters, before, rtol=ROUNDING, atol=ROUNDING * before[0]))
 
 
 def _inertial(parameters: Array) -> list[str]:
-    """Return an ``<inertial>`` about the centre of mass, line by line."""
     body = central_inertial(parameters)
     size = np.sqrt(np.trace(pseudo_inertia(parameters)[0][:3, :3]) / body.mass)  # [m]
-    com = np.where(np.abs(body.com) > _ROUNDING * size, body.com, 0.0)
-    least = _ROUNDING * body.mass * size**2
+    com = np.where(np.abs(body.com) > ROUNDING * size, body.com, 0.0)
+    least = ROUNDING * body.mass * size**2
     inertia = np.where(np.abs(body.inertia) > least, body.inertia, 0.0)
     moments = " ".join(
         f'{key}="{numbers_text([value])}"' for key, value in zip(MOMENTS, inertia, strict=True)

@@ -1,29 +1,35 @@
-"""Comparison of results, from their result.json files only, and its page."""
+"""Comparison of results, from their result.json files only, or of the units of a fleet: pages."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from html import escape
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
-
-import numpy as np
 
 from robotid.base.exceptions import DataError
 from robotid.base.files import check_file, write_text
 from robotid.base.findings import listed
 from robotid.base.text import period
-from robotid.base.typing import Array
 from robotid.output.files.result_file import load_result
-from robotid.output.files.urdf import terms_from_facts
-from robotid.output.pages.charts import Chart, Series, chart_html
-from robotid.output.pages.html import Cell, block, code, listing, number, page, percent, text
+from robotid.output.pages.html import (
+    Cell,
+    Column,
+    block,
+    code,
+    facts_html,
+    listing,
+    number,
+    page,
+    percent,
+    text,
+    with_error,
+)
 from robotid.output.report.tables import both
-from robotid.robot.drive_term import DriveMotion
 from robotid.robot.drives import TERMS
 
-_SPEEDS = 40  # of a friction curve, in each direction
 _FAR = 3.0  # combined standard errors beyond which a difference is in bold
-_TONES = 8
 _FILES = ("urdf", "identification", "validation")  # settings that are shown as inputs
 
 
@@ -62,9 +68,8 @@ def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
         "fitted": _errors([result["identification"] for result in results]),
         "fitted_alike": len({_recordings(result, "identification") for result in results}) == 1,
         "notes": notes,
-        "friction": _friction_curves(results),
         "base_parameters": _base_parameters(results),
-        "settings": _differences([_flat(_chosen(result)) for result in results]),
+        "settings": _differences([_flat(result["settings"]) for result in results]),
         "inputs": _inputs(results),
         "versions": _differences([r.get("versions", {"robotid": r["robotid"]}) for r in results]),
     }
@@ -84,10 +89,7 @@ def _label(k: int) -> str:
 
 
 def _short_names(paths: Sequence[str | Path]) -> dict[str, str]:
-    """Return the shortest unique end of each path.
-
-    A common end of all paths is left out, as "result.json" of folders a and b.
-    """
+    """Return the shortest unique end of each path, without the end that all have in common."""
     parts = {str(path): Path(path).resolve().parts for path in paths}
     every, common = set(parts.values()), 0
     while len(every) > 1 and len({names[-common - 1 :][:1] for names in every}) == 1:
@@ -154,7 +156,6 @@ def _by_recording(result: Mapping[str, Any]) -> dict[tuple[Any, ...], dict[str, 
 
 
 def _signals(result: Mapping[str, Any], key: tuple[Any, ...]) -> dict[str, Any]:
-    """Return the signal settings of a validation recording, and its number of samples used."""
     entries = [entry for entry in result["inputs"] if entry.get("role") == "validation"]
     entry = entries[_recordings(result, "validation").index(key)]
     return {**entry["signals"], "rows": entry["rows_used"]}
@@ -164,10 +165,10 @@ def _common_recordings(
     results: Sequence[Mapping[str, Any]], names: Mapping[str, str]
 ) -> tuple[dict[tuple[Any, ...], dict[str, Any]], list[str]]:
     """Return the validation recordings of all results, and notes on what is not comparable."""
-    each = [_by_recording(result) for result in results]
-    common = {k: v for k, v in each[0].items() if all(k in other for other in each[1:])}
+    recordings = [_by_recording(result) for result in results]
+    common = {k: v for k, v in recordings[0].items() if all(k in other for other in recordings)}
     notes = []
-    for k, by_recording in enumerate(each):
+    for k, by_recording in enumerate(recordings):
         left = [names[v["log"]] for key, v in by_recording.items() if key not in common]
         if left:
             notes.append(
@@ -207,93 +208,35 @@ def _spread(values: Sequence[float | None]) -> float:
     return max(known) - min(known) if len(known) > 1 else -1.0
 
 
-def _friction_curves(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return the friction of each joint's drive over its speed, without load, at q = 0.
-
-    The speeds span the range of all recordings. A joint without stated range or without friction
-    is left out. "load" is the friction torque per load torque, None without such a term.
-    """
-    found = []
-    for joint in dict.fromkeys(joint for result in results for joint in result["joints"]):
-        frictions = [result.get("friction", {}).get(joint, {}) for result in results]
-        ranges = [friction.get("data_range", {}) for friction in frictions]
-        fastest = max((own["v"][1] for own in ranges if "v" in own), default=0.0)
-        v = fastest * np.arange(-_SPEEDS, _SPEEDS + 1) / _SPEEDS
-        curves = [_friction_curve(result, joint, v) for result in results]
-        if not (fastest > 0 and any(torque is not None for torque, _ in curves)):
-            continue
-        known = np.array([torque for torque, _ in curves if torque is not None])
-        found.append(
-            {
-                "joint": joint,
-                "unit": _unit_of_force(results, joint),
-                "speeds": v.tolist(),
-                "torques": [None if x is None else x.tolist() for x, _ in curves],
-                "load": [load for _, load in curves],
-                "difference": float(np.max(np.ptp(known, axis=0)) / (np.abs(known).max() or 1.0)),
-            }
-        )
-    return sorted(found, key=lambda entry: -entry["difference"])
-
-
-def _friction_curve(
-    result: Mapping[str, Any], joint: str, v: Array
-) -> tuple[Array | None, float | None]:
-    """Return the friction of a joint's own drive at some speeds, and its load coefficient."""
-    value = {entry["name"]: entry["value"] for entry in result["drive_parameters"]}
-    own = terms_from_facts(result.get("own_terms", {})).get(joint, ())
-    terms = (*TERMS.values(), *own)
-    none = np.zeros_like(v)
-    motion = DriveMotion(none, v, none, np.sign(v), none, none)
-    parts = [
-        value[name] * term.column(motion)
-        for term in terms
-        if term.part == "friction" and (name := f"{joint}.{term.name}") in value
-    ]
-    return (np.sum(parts, axis=0) if parts else None), value.get(f"{joint}.load")
-
-
-def _unit_of_force(results: Sequence[Mapping[str, Any]], joint: str) -> str:
-    """Return the unit of a joint's torque."""
-    stated = (result["identification"]["per_joint"].get(joint) for result in results)
-    return next((entry["unit"] for entry in stated if entry), "N m")
-
-
 def _base_parameters(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return the values of all results, with (b_k - b_1) / sqrt(s_k^2 + s_1^2) or None."""
-    each = [{e["name"]: e for e in result["base_parameters"]} for result in results]
-    stated = {name: entry for by_name in reversed(each) for name, entry in by_name.items()}
+    by_name = [{e["name"]: e for e in result["base_parameters"]} for result in results]
     rows = []
-    for name in dict.fromkeys(name for by_name in each for name in by_name):
-        own = [by_name.get(name, {}) for by_name in each]
+    for name in dict.fromkeys(name for entries in by_name for name in entries):
+        stated = [entries.get(name, {}) for entries in by_name]
+        first = next(entry for entry in stated if entry)
         rows.append(
             {
                 "name": name,
-                "unit": stated[name]["unit"],
-                "expression": stated[name]["expression"],
-                "values": [entry.get("value") for entry in own],
-                "std_errors": [entry.get("std_error") for entry in own],
-                "differences": [_difference(own[0], entry) for entry in own[1:]],
+                "unit": first["unit"],
+                "expression": first["expression"],
+                "values": [entry.get("value") for entry in stated],
+                "std_errors": [entry.get("std_error") for entry in stated],
+                "differences": [_difference(stated[0], entry) for entry in stated[1:]],
             }
         )
-    return sorted(rows, key=lambda row: -_farthest(row["differences"]))
+    return sorted(rows, key=_largest, reverse=True)
 
 
-def _farthest(differences: Sequence[float | None]) -> float:
-    return max((abs(d) for d in differences if d is not None), default=-1.0)
+def _largest(row: Mapping[str, Any]) -> float:
+    return max((abs(d) for d in row["differences"] if d is not None), default=-1.0)
 
 
 def _difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> float | None:
     if one.get("std_error") is None or other.get("std_error") is None:
         return None
     combined = math.hypot(one["std_error"], other["std_error"])
-    ratio = (other["value"] - one["value"]) / combined if combined > 0 else math.inf
-    return ratio if math.isfinite(ratio) else None
-
-
-def _chosen(result: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a job without its files, which are inputs."""
-    return {k: v for k, v in result["settings"].items() if k not in _FILES}
+    return (other["value"] - one["value"]) / combined if combined > 0 else None
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
@@ -316,7 +259,7 @@ def _plain(value: object) -> str:
 
 def _differences(each: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
     """Return the keys whose values differ; "" where a key is missing."""
-    keys = dict.fromkeys(key for values in each for key in values)
+    keys = dict.fromkeys(key for values in each for key in values if key not in _FILES)
     rows = [{"name": key, "values": [values.get(key, "") for values in each]} for key in keys]
     return [row for row in rows if len(set(row["values"])) > 1]
 
@@ -338,69 +281,42 @@ def _inputs(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def comparison_page(content: Mapping[str, Any]) -> str:
     """Return the HTML of the page."""
+    results = content["results"]
+    robots = ", ".join(dict.fromkeys(result["robot"] for result in results))
+    title = f"{robots}: {len(results)} results compared"
     sections = {
         "errors": ("Prediction errors", _errors_section(content)),
-        "friction": ("Friction", _friction_section(content)),
         "settings": ("Different settings", _differing(content, "settings", "setting")),
         "base": ("Base parameters", _base_section(content)),
         "inputs": ("Inputs", _inputs_section(content)),
         "versions": ("Different versions", _differing(content, "versions", "package")),
     }
-    robots = ", ".join(dict.fromkeys(result["robot"] for result in content["results"]))
-    title = f"{robots}: {len(content['results'])} results compared"
-    verdicts = "".join(map(_verdict, range(len(content["results"])), content["results"]))
-    return page(title, f"<h1>{escape(title)}</h1>\n{verdicts}", sections)
+    return page(title, f"<h1>{escape(title)}</h1>\n{''.join(map(_verdict, results))}", sections)
 
 
-def _verdict(k: int, result: Mapping[str, Any]) -> str:
+def _verdict(result: Mapping[str, Any]) -> str:
     return block(
         "comparison.verdict",
         status=escape(result["verdict"]["status"]),
-        key=_key(k),
         label=result["label"],
+        name=escape(result["name"]),
         estimator=escape(result["estimator"]),
         path=code(result["path"]).html,
         reasons="".join(f"<li>{escape(reason)}</li>" for reason in result["verdict"]["reasons"]),
     )
 
 
-def _tone(k: int) -> str:
-    return f"tone-{k % _TONES + 1}"
-
-
-def _key(k: int) -> str:
-    """Return a patch in a result's colour."""
-    return (
-        '<svg width="14" height="10" style="vertical-align: baseline" aria-hidden="true">'
-        f'<path d="M0 0h14v10h-14z" fill="var(--{_tone(k)})"/></svg>'
-    )
-
-
-def _legend(content: Mapping[str, Any]) -> str:
-    """Return the legend of colours and letters of the results."""
-    keys = "".join(
-        f"<span>{_key(k)} {result['label']} {escape(result['name'])}</span> "
-        for k, result in enumerate(content["results"])
-    )
-    return f'<p class="legend">{keys}</p>\n'
-
-
-def _columns(
-    content: Mapping[str, Any], key: str, form: str, words: str = "{}"
-) -> list[tuple[str, str, str]]:
-    """Return a column for each result: its heading, the form, and "key label" as its key."""
+def _columns(content: Mapping[str, Any], key: str, form: str, words: str = "{}") -> list[Column]:
     labels = [result["label"] for result in content["results"]]
     return [(words.format(label), form, f"{key} {label}") for label in labels]
 
 
 def _cells(content: Mapping[str, Any], key: str, values: Sequence[Any]) -> dict[str, Any]:
-    """Return the values of the results by the keys of their columns."""
     labels = [result["label"] for result in content["results"]]
     return {f"{key} {label}": x for label, x in zip(labels, values, strict=True)}
 
 
 def _errors_section(content: Mapping[str, Any]) -> str:
-    notes = "".join(f"<li>{escape(note)}</li>" for note in content["notes"])
     tables = ""
     for entry in content["validation"]:
         caption = f"{entry['name']} {period(entry['start'], entry['end'])}: not fitted"
@@ -408,8 +324,9 @@ def _errors_section(content: Mapping[str, Any]) -> str:
     are_alike = content["fitted_alike"]
     tables += "" if are_alike else block("comparison.not_alike")
     tables += _error_table("Fitted samples of each result", content, content["fitted"], are_alike)
+    notes = "".join(f"<li>{escape(note)}</li>" for note in content["notes"])
     notes = f"<ul>{notes}</ul>\n" if notes else ""
-    return block("comparison.errors", legend=_legend(content), notes=notes, tables=tables)
+    return block("comparison.errors", notes=notes, tables=tables)
 
 
 def _error_table(
@@ -421,84 +338,46 @@ def _error_table(
         *_columns(content, "rmse", ".3g", "{} RMSE"),
         ("unit", "text", "unit"),
     ]
-    entries = [
-        entry
-        | _cells(content, "error", _percents(entry["relative_error_pct"], are_alike))
-        | _cells(content, "rmse", entry["rmse"])
-        for entry in map(dict, rows)
-    ]
+    entries = []
+    for row in rows:
+        errors = row["relative_error_pct"]
+        cells = [percent(error) for error in errors]
+        known = [cell.html for cell, error in zip(cells, errors, strict=True) if error is not None]
+        if are_alike and len(known) > 1:
+            least = percent(min(error for error in errors if error is not None)).html
+            cells = [_bold(x) if x.html == least and known.count(least) == 1 else x for x in cells]
+        entries.append(
+            {**row, **_cells(content, "error", cells), **_cells(content, "rmse", row["rmse"])}
+        )
     return listing(caption, columns, entries)
 
 
-def _percents(errors: Sequence[float | None], are_alike: bool) -> list[Cell]:
-    """Return the errors, the smallest in bold if they are comparable and it is unique."""
-    cells = [percent(error) for error in errors]
-    known = [(error, cell.html) for error, cell in zip(errors, cells, strict=True) if error]
-    least = min(known)[1] if known and are_alike else ""
-    if len(known) < 2 or [html for _, html in known].count(least) != 1:
-        return cells
-    return [_bold(cell) if cell.html == least else cell for cell in cells]
-
-
 def _bold(cell: Cell) -> Cell:
-    return Cell(f"<strong>{cell.html}</strong>", "number", cell.value)
-
-
-def _friction_section(content: Mapping[str, Any]) -> str:
-    charts = "".join(_friction_figure(content["results"], entry) for entry in content["friction"])
-    if not charts:
-        return "<p>No result has friction curves with a range of speeds.</p>\n"
-    return block("comparison.friction", legend=_legend(content), charts=charts)
-
-
-def _friction_figure(results: Sequence[Mapping[str, Any]], entry: Mapping[str, Any]) -> str:
-    v, unit = np.array(entry["speeds"]), entry["unit"]
-    series = tuple(  # with a gap at speed 0, where the sign changes
-        Series(result["label"], np.where(v == 0, np.nan, np.array(torque)), _tone(k))
-        for k, (result, torque) in enumerate(zip(results, entry["torques"], strict=True))
-        if torque is not None
-    )
-    title = f"Friction of {entry['joint']} over its speed, by result"
-    speed = f"speed [{'rad/s' if unit == 'N m' else 'm/s'}]"
-    chart = Chart(title, v, series, speed, f"friction [{unit}]", height=150)
-    loads = ", ".join(
-        f"{result['label']} {load:.3g}"
-        for result, load in zip(results, entry["load"], strict=True)
-        if load is not None
-    )
-    of_load = f"; additional friction per {unit} of load: {loads}" if loads else ""
-    return chart_html(chart, f"<strong>{escape(entry['joint'])}</strong>{of_load}")
+    return replace(cell, html=f"<strong>{cell.html}</strong>")
 
 
 def _base_section(content: Mapping[str, Any]) -> str:
-    _, *others = _columns(content, "difference", ".1f", "({} − A) / s")
     columns = [
         ("parameter", "code", "name"),
-        *others,
+        *_columns(content, "difference", ".1f", "({} − A) / s")[1:],
         *_columns(content, "value", ".4g"),
         ("unit", "text", "unit"),
     ]
     entries, different = [], 0
-    for entry in map(dict, content["base_parameters"]):
-        cells = [percent(None), *map(_far_in_bold, entry["differences"])]
-        different += any("strong" in cell.html for cell in cells)
-        values = list(_stated(entry))
-        rows = _cells(content, "difference", cells) | _cells(content, "value", values)
-        entries.append(entry | rows)
+    for entry in content["base_parameters"]:
+        is_far = [x is not None and abs(x) > _FAR for x in entry["differences"]]
+        shown = [number(x, "z.1f") for x in entry["differences"]]
+        shown = [_bold(x) if far else x for x, far in zip(shown, is_far, strict=True)]
+        values = [
+            both(math.nan if value is None else value, math.inf if error is None else error)
+            for value, error in zip(entry["values"], entry["std_errors"], strict=True)
+        ]
+        different += any(is_far)
+        rows = _cells(content, "difference", [None, *shown]) | _cells(content, "value", values)
+        entries.append({**entry, **rows})
     table = listing("Base parameters ± standard errors", columns, entries, is_data=True)
     figures = {"different": different, "count": len(entries), "far": f"{_FAR:g}"}
     return block("comparison.base", table=table, **figures)
-
-
-def _stated(entry: Mapping[str, Any]) -> Iterator[Cell]:
-    """Yield each value with its standard error, to the digits of the error."""
-    for value, error in zip(entry["values"], entry["std_errors"], strict=True):
-        yield both(math.nan if value is None else value, math.inf if error is None else error)
-
-
-def _far_in_bold(difference: float | None) -> Cell:
-    shown = number(difference, "z.1f")
-    return _bold(shown) if difference is not None and abs(difference) > _FAR else shown
 
 
 def _differing(content: Mapping[str, Any], key: str, head: str) -> str:
@@ -515,10 +394,100 @@ def _inputs_section(content: Mapping[str, Any]) -> str:
         ("role", "text", "role"), *_columns(content, "in", "text"), ("file", "code", "path"),
         ("from s", ".6g", "start"), ("to s", ".6g", "end"), ("SHA-256", "code", "sha256"),
     ]  # fmt: skip
-    entries = [
-        row
-        | _cells(content, "in", [text("yes" if x else "no", flag=not x) for x in row["in"]])
-        | {"sha256": row["sha256"] or "not read from a file"}
-        for row in map(dict, content["inputs"])
-    ]
+    entries = []
+    for row in content["inputs"]:
+        cells = [text("yes" if x else "no", flag=not x) for x in row["in"]]
+        sha256 = row["sha256"] or "not read from a file"
+        entries.append({**row, **_cells(content, "in", cells), "sha256": sha256})
     return listing("Files read, different ones first", columns, entries)
+
+
+# ---- the page of a fleet --------------------------------------------------------------------
+
+_ROWS = 20  # failures on the page, and units that differ; all are in the files of results
+_FAILURES = (
+    ("unit", "code", "unit"), ("log", "code", "log"), ("alike", "d", "alike"),
+    ("error", "text", "error"),
+)  # fmt: skip
+_UNLIKE = (
+    ("unit", "code", "unit"), ("parameter", "code", "parameter"), ("value", ".4g", "value"),
+    ("± error", ".4g", "std_error"), ("low", ".4g", "low"), ("high", ".4g", "high"),
+    ("unit of value", "text", "parameter_unit"),
+)  # fmt: skip
+_PARAMETERS = (
+    ("parameter", "code", "name"), ("robot", "text", "robot"), ("units", "d", "units"),
+    ("mean", ".4g", "mean"), ("± error", ".4g", "std_error"), ("spread", ".4g", "spread"),
+    ("low", ".4g", "low"), ("high", ".4g", "high"), ("unit", "text", "unit"),
+)  # fmt: skip
+
+
+def fleet_page(content: Mapping[str, Any]) -> str:
+    """Return the HTML of the page."""
+    failures, unlike = content["failures"], content["unlike"]
+    facts = {
+        "Units": f"{content['done']} of {content['units']} identified",
+        "Logs": str(content["logs"]),
+        "Verdicts": ", ".join(f"{n} {escape(v)}" for v, n in content["verdicts"].items()) or "none",
+        "Failures": str(len(failures)),
+        "Units that differ": str(len({entry["unit"] for entry in unlike})),
+    }
+    sections = {
+        "failures": ("Failures", _failures(content)),
+        "unlike": ("Units that differ", _unlike(content)),
+        "parameters": ("Variation between units", _parameters(content)),
+    }
+    title = f"Fleet of {content['units']} units"
+    return page(title, f"<h1>{title}</h1>\n{facts_html(facts)}", sections)
+
+
+def _failures(content: Mapping[str, Any]) -> str:
+    """Return the failures, the first of each kind first."""
+    failures = content["failures"]
+    kinds = [_kind(failure) for failure in failures]
+    count, first = Counter(kinds), {kind: k for k, kind in reversed([*enumerate(kinds)])}
+    order = sorted(range(len(kinds)), key=lambda k: (first[kinds[k]] != k, k))
+    rows = [
+        failures[k] | {"log": failures[k]["log"] or "all", "alike": count[kinds[k]]}
+        for k in order[:_ROWS]
+    ]
+    table = listing("Units and logs that were not identified", _FAILURES, rows)
+    return table + _more(len(failures), "fleet.parquet") if table else "<p>None.</p>\n"
+
+
+def _kind(failure: Mapping[str, str]) -> str:
+    """Return the error without the names of its unit and log."""
+    kind = failure["error"]
+    for name in (failure["log"], PurePath(failure["log"]).name, failure["unit"]):
+        kind = kind.replace(name, "") if name else kind
+    return kind
+
+
+def _more(count: int, file: str) -> str:
+    return block("fleet.more", count=count - _ROWS, file=file) if count > _ROWS else ""
+
+
+def _with_errors(entry: Mapping[str, Any], value: str, ends: str) -> dict[str, Any]:
+    """Return an entry with its value and ends to the digits of its standard error."""
+    error = entry["std_error"]
+    digits, std_error = with_error(entry[value], error)
+    low, high = (with_error(x, error)[0] for x in entry[ends])
+    return {**entry, value: digits, "std_error": std_error, "low": low, "high": high}
+
+
+def _unlike(content: Mapping[str, Any]) -> str:
+    rows = [_with_errors(entry, "value", "others") for entry in content["unlike"][:_ROWS]]
+    table = listing("Units that differ from the others", _UNLIKE, rows, is_data=True)
+    more = _more(len(content["unlike"]), "fleet.json")
+    return block("fleet.unlike") + table + more if table else "<p>None.</p>\n"
+
+
+def _parameters(content: Mapping[str, Any]) -> str:
+    rows = [
+        _with_errors(entry, "mean", "next_interval")
+        | {"spread": with_error(entry["spread"], entry["spread"])[1]}
+        for entry in content["parameters"]
+    ]
+    table = listing("Base parameters of the units", _PARAMETERS, rows, is_data=True)
+    if not table:
+        return "<p>Fewer than three units of one robot were identified.</p>\n"
+    return block("fleet.parameters") + table

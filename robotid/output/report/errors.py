@@ -9,10 +9,9 @@ from robotid.diagnosis.verdict.verdict import GOOD, GOOD_POSITION, POOR, POOR_PO
 from robotid.estimation.fitting.evaluation import Metrics
 from robotid.identification.result import Identification
 from robotid.identification.summary import joint_reason, verdict_cell
-from robotid.output.pages.html import code, listing, percent, text
+from robotid.output.pages.html import block, code, listing, percent, text
 
-_SMALL = 1e-3  # [rad or m] unit of position errors
-_ROWS = 10  # joints that are visible without unfolding
+VISIBLE = 10  # joints that are visible without unfolding
 _WIDEST = 150.0  # [%] end of the scale; larger errors end there, too
 _COLUMNS = (
     ("joint", "code", "joint"), ("error %", "%", "relative_error_pct"),
@@ -69,8 +68,8 @@ POSITION = Quantity(
         "command": Mark("command", "M-3 6l6 6m0 -6l-6 6", "line"),
         "steady": Mark("constant speed", "M-3 9h6", "line"),
     },
-    _SMALL,
-    "m",
+    scale=1e-3,
+    prefix="m",
 )
 
 
@@ -123,18 +122,6 @@ def _share(measured: Mapping[str, Any]) -> float:
     return float("inf") if error is None else float(error)
 
 
-@dataclass(frozen=True)
-class _Bar:
-    """The error of one joint: number, name, error [%], those of other predictions, verdict."""
-
-    row: int
-    joint: str
-    error: float | None
-    others: Mapping[str, float]
-    status: str
-    reasons: Sequence[str]
-
-
 def error_bars(
     quantity: Quantity,
     recordings: Sequence[Errors],
@@ -144,30 +131,46 @@ def error_bars(
     has_why: bool = False,
 ) -> str:
     """Return the errors of the joints on their worst recordings as bars, the worst joint first."""
-    worst, bars = worst_errors(recordings), []
+    worst = worst_errors(recordings)
     # the only validation recording need not be named
     is_alone = len(recordings) == 1 and not recordings[0].is_fitted
     alone = f" on {recordings[0].name}" if is_alone else ""
+    items = []
     for joint in [*worst, *(joint for joint in verdicts if joint not in worst)]:
-        measured, verdict = worst.get(joint, {}), verdicts.get(joint, _UNKNOWN)
-        reasons = [reason.replace(alone, "") if alone else reason for reason in verdict["reasons"]]
-        errors = {key: measured.get(f"{key}_relative_error_pct") for key in quantity.marks}
-        others = {key: error for key, error in errors.items() if error is not None}
-        error = _share(measured) if measured else None
-        bars.append(_Bar(rows.index(joint), joint, error, others, verdict["status"], reasons))
-    items = [_row(bar, quantity, has_why=has_why) for bar in bars]
-    more = "".join(items[_ROWS:])
+        verdict, row, link, picture = verdicts.get(joint, _UNKNOWN), rows.index(joint), "", ""
+        status = verdict["status"]
+        reasons = [reason.replace(alone, "") for reason in verdict["reasons"]]
+        why = joint_reason(joint, reasons[-1:] if status == "good" else reasons)
+        error = _share(worst[joint]) if joint in worst else None
+        if error is not None:
+            picture = _picture(quantity, row, joint, error, worst[joint])
+            if has_why and why:  # else the link would stand alone on a line
+                link = block("report.analysis", row=row, joint=escape(joint))
+        items.append(
+            block(
+                "report.bar", kind=status.replace(" ", "-"), row=row, joint=code(joint).html,
+                picture=picture, error=percent(error).html, status=status, why=escape(why) + link,
+            )
+        )  # fmt: skip
+    more = "".join(items[VISIBLE:])
     if more:
-        words = f"{len(items) - _ROWS} more joints with smaller errors"
+        words = f"{len(items) - VISIBLE} more joints with smaller errors"
         more = f"<details><summary>{words}</summary><ol>{more}</ol></details>\n"
-    kind = "not fitted"
-    if recordings[0].is_fitted:
-        kind = "fitted samples, without validation log"
-    return (
-        f'<h2 id="worst">{quantity.title}, worst joint first <span class="note">{quantity.share}, '
-        f"{kind}</span></h2>\n{_legend(quantity, {key for bar in bars for key in bar.others})}"
-        f'<ol class="bars">{"".join(items[:_ROWS])}</ol>\n{more}'
+    fitted = "fitted samples, without validation log"
+    return block(
+        "report.bars",
+        title=quantity.title,
+        share=quantity.share,
+        kind=fitted if recordings[0].is_fitted else "not fitted",
+        legend=_legend(quantity, {key for m in worst.values() for key in _others(quantity, m)}),
+        bars="".join(items[:VISIBLE]),
+        more=more,
     )
+
+
+def _others(quantity: Quantity, measured: Mapping[str, Any]) -> dict[str, float]:
+    errors = {key: measured.get(f"{key}_relative_error_pct") for key in quantity.marks}
+    return {key: error for key, error in errors.items() if error is not None}
 
 
 def _at(value: float) -> str:
@@ -175,37 +178,20 @@ def _at(value: float) -> str:
     return f"{100 * (min(value, _WIDEST) / _WIDEST) ** 0.5:.2f}%"
 
 
-def _row(bar: _Bar, quantity: Quantity, *, has_why: bool) -> str:
-    """Return the row of a joint with its reason."""
-    reasons = bar.reasons[-1:] if bar.status == "good" else bar.reasons
-    why, link, picture = joint_reason(bar.joint, reasons), "", ""
-    if bar.error is not None:
-        picture = _picture(bar, bar.error, quantity)
-        if has_why and why:  # else the link would stand alone on a line
-            label = f"residual analysis of {escape(bar.joint)}"
-            link = f' <a href="#why-{bar.row}" aria-label="{label}">analysis</a>'
-    kind, error = bar.status.replace(" ", "-"), percent(bar.error).html
-    return (
-        f'<li class="{kind}"><a class="code" href="#joint-{bar.row}">{code(bar.joint).html}</a>'
-        f'{picture}<span class="number">{error} %</span>'
-        f'<strong>{bar.status}</strong><span class="why">{escape(why)}{link}</span></li>\n'
-    )
-
-
-def _picture(bar: _Bar, error: float, quantity: Quantity) -> str:
-    """Return the bar of a joint with the markers of other predictions."""
-    others, lines, words = "", "", []
-    for limit in quantity.limits:
-        lines += f'<line x1="{_at(limit)}" x2="{_at(limit)}" y1="-2" y2="18"/>'
-    for key, value in bar.others.items():
+def _picture(
+    quantity: Quantity, row: int, joint: str, error: float, measured: Mapping[str, Any]
+) -> str:
+    others, words = "", []
+    for key, value in _others(quantity, measured).items():
         mark = quantity.marks[key]
         others += f'<svg x="{_at(value)}" overflow="visible" aria-hidden="true">{mark.svg}</svg>'
         words.append(f"{mark.words} {percent(value).html} %")
-    title = f"{bar.joint}: error {percent(error).html} %; for comparison {', '.join(words)}"
-    return (
-        f'<svg class="bar" height="18" role="img" aria-labelledby="bar{bar.row}-title">'
-        f'<title id="bar{bar.row}-title">{escape(title)}</title><g class="limits">{lines}</g>'
-        f'<rect y="4" width="{_at(error)}" height="10"/>{others}</svg>'
+    lines = "".join(
+        f'<line x1="{_at(limit)}" x2="{_at(limit)}" y1="-2" y2="18"/>' for limit in quantity.limits
+    )
+    title = f"{joint}: error {percent(error).html} %; for comparison {', '.join(words)}"
+    return block(
+        "report.picture", row=row, title=escape(title), lines=lines, width=_at(error), others=others
     )
 
 

@@ -11,11 +11,20 @@ from robotid.base.files import write_text
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.base.versions import __version__
-from robotid.design.clearance import Clearance
 from robotid.design.limits import LIMITS, Course
 from robotid.design.previews import Preview
-from robotid.output.pages.charts import Chart, Series, chart_html
-from robotid.output.pages.html import Section, block, facts_html, listing, page
+from robotid.output.pages.html import (
+    TONES,
+    Chart,
+    Section,
+    Series,
+    block,
+    chart_html,
+    facts_html,
+    listing,
+    page,
+    paragraphs,
+)
 from robotid.robot.model import RobotModel
 
 _UNITS = ("rad", "rad/s", "rad/s²", "rad/s³", "N m", "W")
@@ -30,17 +39,9 @@ _UNCHECKED = {
     "left_alone": "Not checked, since in contact by design",
     "built_near": "Close by design, with a smaller clearance",
 }
-_TONES = 8  # distinguishable colours of lines in one chart
 _NAMED = 5  # base parameters with the largest expected standard errors that are named
 _SHARP = 0.1  # share of the plausible range below which one is well determined ...
 _OPEN = 0.5  # ... and above which it is undetermined
-_WIDE = 10.0  # ratio of distances from which their axis is logarithmic
-_SOURCES = {
-    "data": "by the motion",
-    "mixed": "by motion and URDF together",
-    "prior": "by the URDF alone",
-    "bound": "by the bounds of physical consistency",
-}
 
 
 def write_motion_page(
@@ -50,10 +51,7 @@ def write_motion_page(
     course: Course,
     expected: Preview,
 ) -> Path:
-    """Write a designed motion's use of the limits and its expected errors, as one HTML file.
-
-    The file loads nothing from the network. It is written under a temporary name, then renamed.
-    """
+    """Write a designed motion's use of the limits and its expected errors, as one HTML file."""
     sections = {
         "limits": Section("Smallest margin to each limit", _limit_table(model, content, course)),
         "time": Section("Course over time", _over_time(model, content, course)),
@@ -65,7 +63,6 @@ def write_motion_page(
 
 
 def _head(model: RobotModel, content: Mapping[str, Any]) -> str:
-    """Return the heading, and the criterion and constraints of the design."""
     condition, how = content["condition_number"], f"{content['seconds']:.1f} s"
     if content["starts"]:
         settled = "converged" if content["converged"] else "not converged: allow more seconds"
@@ -129,7 +126,6 @@ def _nearest(where: str, distance: float, time: float, required: float, between:
 
 
 def _over_time(model: RobotModel, content: Mapping[str, Any], course: Course) -> str:
-    """Return charts of the use of each limit, of unlimited quantities, and of distances."""
     charts = []
     for k, kind in enumerate(LIMITS):
         is_limited = np.isfinite(course.limits.sizes[k])
@@ -148,61 +144,27 @@ def _over_time(model: RobotModel, content: Mapping[str, Any], course: Course) ->
             name = f"{kind} [{' or '.join(units)}]"
             chart = Chart(f"{kind} of each joint", course.t, lines, "time [s]", name, "time")
             charts.append(chart_html(chart, f"{kind.capitalize()} without a stated limit"))
-    if course.clearance is not None and course.nearest is not None:
-        charts.append(_distance_chart(model, course, course.clearance))
     return f'<div class="plots">\n{"".join(charts)}</div>\n'
 
 
 def _lines(model: RobotModel, values: Array, joints: Array) -> list[Series]:
-    return [
-        Series(model.joints[j], values[:, j], f"tone-{j % _TONES + 1}") for j in joints.tolist()
-    ]
-
-
-def _distance_chart(model: RobotModel, course: Course, clearance: Clearance) -> str:
-    """Return the chart of distances between links, and to the floor and boxes."""
-    course = course.thinned
-    own = np.array([b in model.tree.links and a in model.tree.links for a, b in clearance.named])
-    series = [Series("clearance", np.full(len(course.t), 1e3 * clearance.least), "text")]
-    changes = course.changes(clearance)
-    near = np.isfinite(clearance.slack)
-    groups = (
-        ("links", own & ~near, "tone-1"),
-        ("floor and boxes", ~own, "tone-2"),
-        ("links close by design", near, "tone-3"),
-    )
-    for label, chosen, tone in groups:
-        if (chosen & changes).any():
-            series.append(Series(label, 1e3 * course.nearness(chosen & changes)[0], tone))
-    low, high = (float(f([f(x.y) for x in series])) for f in (np.min, np.max))
-    is_wide = low > 0 and high > _WIDE * low
-    chart = Chart(
-        "distance of the two nearest hulls", course.t, tuple(series), "time [s]",
-        "distance [mm]", link="time", logarithmic="y" if is_wide else "",
-    )  # fmt: skip
-    return chart_html(
-        chart, "Smallest distance between two links, and to floor and boxes, where it changes"
-    )
+    return [Series(model.joints[j], values[:, j], f"tone-{j % TONES + 1}") for j in joints.tolist()]
 
 
 def _expected(preview: Preview) -> str:
-    """Return the standard errors expected of a log of the motion, as paragraphs."""
     found, noise = preview.expected, preview.noise
     ratio = np.minimum(preview.base_error / preview.plausible, 1.0)
     order = np.argsort(-ratio, kind="stable")[:_NAMED]
     least = [
         f"{found.mapping.base_names[k]} {100 * ratio[k]:.0f} %" for k in order if ratio[k] > _OPEN
     ]
-    counts = {source: found.sources.count(source) for source in dict.fromkeys(found.sources)}
-    sources = [f"{count} {_SOURCES[source]}" for source, count in counts.items()]
     stds = [f"{joint} {s:.2g}" for joint, s in zip(found.model.joints, noise.std, strict=True)]
     sentences = [
         f"{preview.words}.",
         f"Of {len(ratio)} base parameters, {int((ratio < _SHARP).sum())} have an expected standard "
         f"error below 10 % of their plausible range, {int((ratio > _OPEN).sum())} above 50 %.",
         f"Largest, in % of the plausible range: {', '.join(least)}." if least else "",
-        f"The standard parameters will be determined: {listed(sources)}.",
         f"Standard deviation of the torque noise, {listed(dict.fromkeys(noise.origins))}: "
         f"{', '.join(stds)} (N m or N).",
     ]
-    return "".join(f"<p>{escape(words)}</p>\n" for words in sentences if words)
+    return paragraphs(sentences)

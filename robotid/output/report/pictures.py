@@ -12,7 +12,6 @@ from robotid.diagnosis.residual.torque_split import (
     Dependence,
     JointTorque,
     friction_split,
-    spectrum,
     spread_rows,
 )
 from robotid.dynamics.prediction import drive_motion_along
@@ -20,12 +19,11 @@ from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.fitted import friction_curve
 from robotid.estimation.fitting.standard_errors import QUANTILE, TorqueBand
 from robotid.identification.result import TorqueIdentification
-from robotid.output.pages.charts import Chart, Plot, Series, broken
+from robotid.output.pages.html import Chart, Plot, Series, broken
 
-_DOTS = 800  # of one friction chart
 _DWARFED = 4.0  # times the height of the measured torque above which the URDF's is hidden
 _PIXELS = 500  # spans closer than one of these pixels are merged
-_POINTS = 600  # of a chart
+_POINTS = 400  # of a chart of the residual analysis, or of friction
 _TONES = {
     "gravity": "tone-1",
     "inertia": "tone-4",
@@ -44,17 +42,8 @@ def plot_torques(
 ) -> Plot:
     """Return charts of measured and identified torque over time, and of the residual.
 
-    Args:
-        identification: The result.
-        joints: The joints; all if none is named.
-        recording: One of ``fitted`` or ``validation``; None: the first validation recording, or
-            the first fitted one.
-
-    Returns:
-        Charts that a notebook shows and ``.write("torques.html")`` saves.
-
-    Raises:
-        DataError: If there is no such joint.
+    Of all joints if none is named; of the recording in ``fitted`` or ``validation``, or of the
+    first validation recording, or the first fitted one.
     """
     require_kind(
         recording, (Evaluation, type(None)), "recording", "one of fitted or validation, or none"
@@ -70,18 +59,7 @@ def plot_torques(
 
 
 def plot_friction(identification: TorqueIdentification, *joints: str) -> Plot:
-    """Return charts of friction against speed, measured and identified, with its band.
-
-    Args:
-        identification: The result.
-        joints: The joints; all if none is named.
-
-    Returns:
-        Charts that a notebook shows and ``.write("friction.html")`` saves.
-
-    Raises:
-        DataError: If there is no such joint, or none that moved.
-    """
+    """Return charts of friction against speed, measured and identified, with its band."""
     names = joints or identification.model.joints
     for name in names:
         _row_of(identification, name)
@@ -93,22 +71,11 @@ def plot_friction(identification: TorqueIdentification, *joints: str) -> Plot:
 
 
 def plot_why(identification: TorqueIdentification, joint: str) -> Plot:
-    """Return charts of the parts of a joint's torque, and of its residual's dependences.
-
-    Args:
-        identification: The result.
-        joint: The joint.
-
-    Returns:
-        Charts that a notebook shows and ``.write("why.html")`` saves.
-
-    Raises:
-        DataError: If there is no such joint.
-    """
+    """Return charts of the parts of a joint's torque, and of its residual's dependences."""
     torque = identification.joint_torques[_row_of(identification, joint)]
     charts = why_charts(torque)
     about = {name: f"residual against {name}" for name in charts}
-    about |= {"split": torque.sentence, "power": "mechanical power"}
+    about["split"] = torque.sentence
     shown = tuple((chart, f"{joint}: {about[name]}") for name, chart in charts.items())
     return Plot(f"Torque parts and residual of {joint}", shown)
 
@@ -119,7 +86,6 @@ def shown_evaluation(found: TorqueIdentification) -> Evaluation:
 
 
 def _row_of(identification: TorqueIdentification, joint: str) -> int:
-    """Return the index of a joint's torque row."""
     require_kind(joint, str, "joint", "the name of a joint")
     names = identification.model.row_names
     if joint not in names:
@@ -155,33 +121,20 @@ def torque_charts(
     )
     spans = unused_spans(t, np.isfinite(model))
     kind = "force" if unit == "N" else "torque"
-    torque = Chart(
-        f"{kind.capitalize()} of {name} over time: measured, identified, URDF",
-        t,
-        (
-            Series("URDF", urdf, "urdf", is_weak=True, is_hidden=_dwarfs(urdf, tau, model)),
-            Series("measured", tau, "text", is_weak=True),
-            Series("identified, 95 % band", model, "predicted", half=half),
-        ),
-        "time [s]",
-        f"{kind} [{unit}]",
-        link,
-        spans,
+    title = f"{kind.capitalize()} of {name} over time: measured, identified, URDF"
+    lines = (
+        Series("URDF", urdf, "urdf", is_weak=True, is_hidden=_dwarfs(urdf, tau, model)),
+        Series("measured", tau, "text", is_weak=True),
+        Series("identified, 95 % band", model, "predicted", half=half),
     )
+    torque = Chart(title, t, lines, "time [s]", f"{kind} [{unit}]", link, spans)
+    title = f"Residual of {name} over time, measured minus identified"
     zero = np.where(np.isfinite(model), 0.0, np.nan)
-    residual = Chart(
-        f"Residual of {name} over time, measured minus identified",
-        t,
-        (
-            Series("95 % band", zero, "residual", half=half, is_weak=True),
-            Series("residual", tau - model, "residual"),
-        ),
-        "time [s]",
-        f"residual [{unit}]",
-        link,
-        spans,
-        height=90,
+    below = (
+        Series("95 % band", zero, "residual", half=half, is_weak=True),
+        Series("residual", tau - model, "residual"),
     )
+    residual = Chart(title, t, below, "time [s]", f"residual [{unit}]", link, spans, height=90)
     return torque, residual
 
 
@@ -194,10 +147,7 @@ def _dwarfs(y: Array, *others: Array) -> bool:
 
 
 def unused_spans(t: Array, used: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
-    """Return the time spans between used samples; those closer than a pixel are merged.
-
-    t (N,) [s], used (N,).
-    """
+    """Return the time spans between used samples (N,); those closer than a pixel are merged."""
     edges = np.flatnonzero(np.diff(np.r_[True, used, True].astype(int))).reshape(-1, 2)
     pixel = float(t[-1] - t[0]) / _PIXELS if len(t) else 0.0
     spans: list[tuple[float, float]] = []
@@ -210,33 +160,6 @@ def unused_spans(t: Array, used: NDArray[np.bool_]) -> tuple[tuple[float, float]
     return tuple(spans)
 
 
-def spectrum_chart(found: TorqueIdentification, evaluation: Evaluation, row: int) -> Chart | None:
-    """Return the spectrum of a joint's torque and residual; None if no sample was used."""
-    motion, used = evaluation.recording.trajectory, evaluation.recording.mask[:, row].astype(bool)
-    name, unit = found.model.row_names[row], found.model.row_units[row]
-    dt = float(np.median(np.diff(motion.t)[np.diff(motion.segment) == 0]))
-    residual = motion.tau[:, row] - evaluation.torques["estimate"][:, row]
-    (f, torque), (_, left) = (
-        spectrum(x, used, motion.segment, dt) for x in (motion.tau[:, row], residual)
-    )
-    if not len(f):
-        return None
-    cutoff = evaluation.recording.signals.cutoff
-    k = (f > 0) & (f <= (np.inf if cutoff is None else 2.0 * cutoff))
-    return Chart(
-        f"Spectrum of torque and residual of {name}",
-        f[k],
-        (
-            Series("torque", np.sqrt(torque[k]), "text", is_weak=True),
-            Series("residual", np.sqrt(left[k]), "residual"),
-        ),
-        "frequency [Hz]",
-        f"density [{unit}/√Hz]",
-        marks=() if cutoff is None else (cutoff,),
-        logarithmic="y",
-    )
-
-
 def friction_chart(
     found: TorqueIdentification, joint: str, *, split: tuple[Array, Array] | None = None
 ) -> Chart | None:
@@ -245,7 +168,7 @@ def friction_chart(
     motion, row = evaluation.recording.trajectory, model.row_names.index(joint)
     left, friction = split or friction_split(model, evaluation, found.standard)
     rows = np.flatnonzero(evaluation.recording.mask[:, row])
-    rows = rows[:: max(1, -(-len(rows) // _DOTS))]
+    rows = rows[:: max(1, -(-len(rows) // _POINTS))]
     is_driven = joint in model.joints and joint not in model.passive
     has_friction = is_driven or joint in model.layout.own
     if not has_friction or not len(rows):
@@ -264,93 +187,58 @@ def friction_chart(
         np.sign(v), v, left[rows, row], friction[rows, row], curve.torque, curve.std
     )
     under = f" at a load of {load:.3g} {unit}" if load else ""
-    return Chart(
-        f"Friction of {joint} against speed, measured and identified",
-        v,
-        (
-            Series("measured", left, "text", "dots", is_weak=True),
-            Series("identified", friction, "predicted", "dots"),
-            Series(f"steady{under}, 95 % band", steady, "residual", half=QUANTILE * std),
-        ),
-        "speed [m/s]" if unit == "N" else "speed [rad/s]",
-        f"friction [{unit}]",
+    title = f"Friction of {joint} against speed, measured and identified"
+    series = (
+        Series("measured", left, "text", "dots", is_weak=True),
+        Series("identified", friction, "predicted", "dots"),
+        Series(f"steady{under}, 95 % band", steady, "residual", half=QUANTILE * std),
     )
+    speed = "speed [m/s]" if unit == "N" else "speed [rad/s]"
+    return Chart(title, v, series, speed, f"friction [{unit}]", height=130)
 
 
-def why_charts(
-    torque: JointTorque, *, link: str = "time", points: int = _POINTS
-) -> dict[str, Chart]:
-    """Return the charts of a joint by name.
-
-    They are "split", the parts of the torque stacked over time; one for each quantity that the
-    residual may depend on, by its name; and "power", if there is a speed. Charts over time show the
-    first recording.
-    """
-    charts = {"split": _split(torque, link, points)}
+def why_charts(torque: JointTorque, *, link: str = "time") -> dict[str, Chart]:
+    """Return the stacked parts of a torque, "split", and its residual against each quantity."""
+    charts = {"split": _split(torque, link)}
     for dependence in torque.follows:
         if dependence.name in (*torque.quantities, "time"):
-            charts[dependence.name] = _residual(torque, dependence, link, points)
-    if torque.power is not None:
-        charts["power"] = _power(torque, torque.power, link, points)
+            charts[dependence.name] = _residual(torque, dependence, link)
     return charts
 
 
-def _split(torque: JointTorque, link: str, points: int) -> Chart:
-    k = _first(torque, points)
+def _split(torque: JointTorque, link: str) -> Chart:
+    k = _first(torque)
     parts = {name: torque.parts[name][k] for name in torque.present}
     values = [*parts.values(), torque.residual[k], torque.tau[k]]
     t, *values = broken(torque.rows.segment[k], torque.rows.t[k], *values)
     *stacked, residual, tau = values
     areas = [Series(name, y, _TONES[name], "area") for name, y in zip(parts, stacked, strict=True)]
     lines = [Series("residual", residual, "residual", "area"), Series("measured", tau, "text")]
-    return Chart(
-        f"Torque of {torque.joint} over time, the sum of {', '.join(parts)} and residual",
-        t,
-        (*areas, *lines),
-        "time [s]",
-        f"torque [{torque.unit}]",
-        link,
-        unused_spans(torque.rows.t[k], torque.used[k]),
-        height=240,
-    )
+    title = f"Torque of {torque.joint} over time, the sum of {', '.join(parts)} and residual"
+    spans, unit = unused_spans(torque.rows.t[k], torque.used[k]), f"torque [{torque.unit}]"
+    return Chart(title, t, (*areas, *lines), "time [s]", unit, link, spans, height=240)
 
 
-def _power(torque: JointTorque, power: Array, link: str, points: int) -> Chart:
-    k = _first(torque, points)
-    speed = torque.quantities["speed"][1]
-    dissipated = torque.parts.get("friction", np.zeros_like(speed)) * speed
-    t, whole, heat = broken(torque.rows.segment[k], torque.rows.t[k], power[k], dissipated[k])
-    title = f"Mechanical power of {torque.joint} over time, and that of its friction"
-    series = Series("into friction", heat, "tone-3"), Series("torque × speed", whole, "text")
-    return Chart(title, t, series, "time [s]", "power [W]", link, height=120)
-
-
-def _residual(torque: JointTorque, dependence: Dependence, link: str, points: int) -> Chart:
+def _residual(torque: JointTorque, dependence: Dependence, link: str) -> Chart:
     name, unit = dependence.name, dependence.unit
     x = torque.rows.time if name == "time" else torque.quantities[name][1]
     rows = np.flatnonzero(torque.used)
     rows = rows[np.argsort(x[rows])]
-    k = rows[spread_rows(len(rows), points)]
+    k = rows[spread_rows(len(rows), _POINTS)]
     mean, error = dependence.at(x[k])
     is_one = name == "time" and len(torque.rows.recordings) == 1
     residual, less = torque.against_time if name == "time" else (torque.residual, "")
-    explained = f" minus its mean over {less}" if less else ""
-    return Chart(
-        title=f"Residual of {torque.joint}{explained} against {name}, with its mean and 95 % "
-        "interval",
-        x=x[k],
-        series=(
-            Series("residual", residual[k], "residual", "dots", is_weak=True),
-            Series("mean", mean, "text", half=QUANTILE * error),
-        ),
-        x_label=f"{name} [{unit}]",
-        y_label=f"residual [{torque.unit}]",
-        link=link if is_one else "",
-        height=120,
+    what = f"Residual of {torque.joint}{f' minus its mean over {less}' if less else ''}"
+    series = (
+        Series("residual", residual[k], "residual", "dots", is_weak=True),
+        Series("mean", mean, "text", half=QUANTILE * error),
     )
+    return Chart(
+        f"{what} against {name}, with its mean and 95 % interval", x[k], series,
+        f"{name} [{unit}]", f"residual [{torque.unit}]", link if is_one else "", height=120,
+    )  # fmt: skip
 
 
-def _first(torque: JointTorque, points: int) -> Array:
-    """Return samples spread evenly over the first recording."""
-    own = np.flatnonzero(torque.rows.recording == 0)
-    return own[spread_rows(len(own), points)]
+def _first(torque: JointTorque) -> Array:
+    rows = np.flatnonzero(torque.rows.recording == 0)
+    return rows[spread_rows(len(rows), _POINTS)]

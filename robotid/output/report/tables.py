@@ -9,23 +9,22 @@ from typing import Any
 import numpy as np
 
 from robotid.base.findings import listed
-from robotid.base.typing import Array
+from robotid.base.versions import versions
 from robotid.diagnosis.verdict.parameter_table import CENTRAL_TERMS, central_parameters
 from robotid.estimation.variation.variation import Variation, VaryingParameter
-from robotid.identification.result import TorqueIdentification
-from robotid.output.files.urdf import urdf_changes
+from robotid.identification.result import Identification, TorqueIdentification
+from robotid.output.files.entries import input_entries
 from robotid.output.pages.html import (
     Cell,
     block,
     code,
-    folded,
     listing,
     number,
+    paragraphs,
     table,
     text,
     with_error,
 )
-from robotid.robot.model import RobotModel
 from robotid.robot.parameters import INERTIAL_TERMS, pseudo_inertia
 
 #: What determined a parameter, by its source.
@@ -36,13 +35,14 @@ SOURCE_NAMES = {
     "bound": "at its bound",
     "stated": "stated",
 }
-_WIDEST = 7  # drive terms, or logs, that a page shows side by side
+_WIDEST = 7  # logs that a page shows side by side
 _FIRST_TERMS = ("kp", "kd", "delay", "limit", "zero")  # of a drive, before all others
 _MILLI = {"s": "ms"}  # units in the table of drives
 _ROLES = {"urdf": "URDF", "identification": "fitted", "validation": "validation"}
-_CHOSEN = {
-    "cv": "selected by cross-validation on the fitted logs",
-    "evidence": "selected by the evidence of the fitted logs",
+_CONSTRAINTS = {  # in the details of a consistent fit
+    "active": "Active constraints",
+    "relaxed": "Extents that contradict the data",
+    "pinned": "Fixed at the URDF's values",
 }
 #: Units of ``CENTRAL_TERMS``.
 _CENTRAL_UNITS = ("kg", "m", "m", "m", *["kg m²"] * 6)
@@ -57,11 +57,6 @@ _PARAMETERS = (
 _BASE = (
     ("parameter", "code", "name"), ("value", ".4g", "value"), ("± error", ".4g", "error"),
     ("relative %", "%", "relative"), ("unit", "text", "unit"), ("expression", "code", "expression"),
-)  # fmt: skip
-_SIGNALS = (
-    ("log", "code", "name"), ("filter", "text", "filter"), ("rate Hz", ".6g", "rate"),
-    ("velocity", "text", "velocity"), ("trim s", ".3g", "trim"),
-    ("minimum speed", ".3g", "min_velocity"), ("gap s", ".3g", "max_gap"),
 )  # fmt: skip
 _INPUTS = (
     ("role", "text", "role"), ("file", "code", "path"), ("samples", "d", "samples"),
@@ -78,22 +73,15 @@ _VARYING = (
 
 
 def parameter_section(
-    model: RobotModel | None,
-    standard: Array | None,
-    entries: Sequence[Mapping[str, Any]],
-    words: str,
-    on_misfit: Collection[str] = (),
+    entries: Sequence[Mapping[str, Any]], words: str, on_misfit: Collection[str] = ()
 ) -> str:
-    """Return all parameters of the links and drives, and the changes of the URDF: standard (p,)."""
+    """Return all parameters of the links and drives."""
     rows = [_parameter(entry, on_misfit) for entry in entries]
     parameters = listing("Parameters of links and drives", _PARAMETERS, rows, is_data=True)
-    changes = folded("changes", "Changes of the URDF", _changes(model, standard))
-    tables = _drive_table(entries) + parameters
-    return block("report.parameters", words=words, tables=tables, changes=changes)
+    return block("report.parameters", words=words, tables=_drive_table(entries) + parameters)
 
 
 def _parameter(entry: Mapping[str, Any], on_misfit: Collection[str]) -> dict[str, Any]:
-    """Return the row of a parameter: the URDF's value, the identified value and its source."""
     owner, _, term = entry["name"].rpartition(".")
     error, prior = _error(entry), entry.get("prior")
     value, uncertainty = with_error(entry["value"], error)
@@ -115,7 +103,6 @@ def _parameter(entry: Mapping[str, Any], on_misfit: Collection[str]) -> dict[str
 
 
 def _drive_table(entries: Sequence[Mapping[str, Any]]) -> str:
-    """Return the drive terms, one row per joint, or one per term if these are more."""
     drives: dict[str, dict[str, Mapping[str, Any]]] = {}
     for entry in entries:
         owner, _, term = entry["name"].rpartition(".")
@@ -131,13 +118,8 @@ def _drive_table(entries: Sequence[Mapping[str, Any]]) -> str:
     units = [_MILLI.get(known[term]["unit"], known[term]["unit"]) for term in terms]
     names = [f"{term} [{unit}]" for term, unit in zip(terms, units, strict=True)]
     cells = [[_short(own.get(term)) for term in terms] for own in drives.values()]
-    headers = ["joint", *names]
     rows = [[code(drive), *row] for drive, row in zip(drives, cells, strict=True)]
-    if len(terms) > max(len(drives), _WIDEST):  # too wide for a page
-        headers = ["term", *drives]
-        columns = zip(*cells, strict=True)
-        rows = [[text(name), *row] for name, row in zip(names, columns, strict=True)]
-    return table("Drives, by joint", headers, rows, is_data=True) if terms else ""
+    return table("Drives, by joint", ["joint", *names], rows, is_data=True) if terms else ""
 
 
 def _error(entry: Mapping[str, Any]) -> float:
@@ -173,28 +155,8 @@ def sources_fact(entries: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     return {name: f'<span class="shares">{shares}</span>{words}'}
 
 
-def _changes(model: RobotModel | None, standard: Array | None) -> str:
-    """Return the changed lines of the URDF, each link's under its name."""
-    if standard is None:
-        return "<p>No URDF was written.</p>\n"
-    lines = [] if model is None else urdf_changes(model, standard)
-    if not lines:
-        return "<p>The URDF is no longer at its path.</p>\n"
-    kinds, html, link = {"-": "del", "+": "ins"}, "", ""
-    for line in lines[2:]:
-        if line[0] in kinds:
-            html += f"<{kinds[line[0]]}>{escape(line)}</{kinds[line[0]]}>\n"
-        elif (name := line.rpartition("@@ ")[2]) != link:  # unchanged lines split a link's changes
-            html, link = f"{html}<strong>{escape(name)}</strong>\n", name
-    title = " and ".join(line.split(" ", 1)[1].strip() for line in lines[:2])
-    return block("report.changes", title=escape(title), lines=html)
-
-
 def body_table(identification: TorqueIdentification) -> str:
-    """Return mass, centre of mass and inertia about it of each link, below them those of the URDF.
-
-    A value that the data do not determine is the URDF's, and has no interval.
-    """
+    """Return mass, centre and inertia about it of each link, below them those of the URDF."""
     central = central_parameters(identification)
     rows = []
     for i, body in enumerate(identification.model.layout.bodies):
@@ -221,8 +183,6 @@ def base_table(identification: TorqueIdentification) -> str:
         error = math.inf if name in undetermined else float(identification.base_error[k])
         shown, uncertainty = with_error(value, error)
         relative = 100 * error / abs(value) if value and math.isfinite(error) else None
-        if relative is not None and relative >= 1000:
-            relative = Cell("&gt; 999", "number", relative)
         rows.append(
             {"name": name, "value": shown, "error": uncertainty, "relative": relative,
              "unit": units[mapping.independent[k]], "expression": mapping.expressions[k]}
@@ -232,122 +192,59 @@ def base_table(identification: TorqueIdentification) -> str:
 
 
 def consistency_section(identification: TorqueIdentification) -> str:
-    """Return whether bodies and drives are consistent; prior, bounds, mass matrix."""
-    is_consistent = identification.is_consistent
-    every = "All bodies and drives are" if is_consistent else "Not all bodies and drives are"
-    notes = "".join(f"<p>{escape(note)}</p>\n" for note in _consistency_notes(identification))
-    return block("report.consistency", all=every, notes=notes)
-
-
-def _consistency_notes(identification: TorqueIdentification) -> list[str]:
-    """Return sentences on mass matrix, prior and bounds of the fit."""
-    check, details = identification.mass_matrix, identification.estimate.details
-    layout = identification.model.layout
+    """Return whether bodies and drives are consistent, and the constraints of the fit."""
+    details, layout = identification.estimate.details, identification.model.layout
     lows = np.linalg.eigvalsh(pseudo_inertia(identification.standard[: layout.n_inertial]))[:, 0]
     wrong = [
         f"{body} ({low:.3g})" for body, low in zip(layout.bodies, lows, strict=True) if low <= 0
     ]
-    share = "at all" if check.is_positive else f"at {100 * check.positive_share:.3g} % of"
-    notes = [
-        f"The mass matrix, armatures included, is positive definite {share} {check.poses} random "
-        f"poses (smallest eigenvalue {check.smallest_eigenvalue:.3g})."
-    ]
-    notes += [f"Inconsistent, with the smallest eigenvalue: {listed(wrong)}."] if wrong else []
-    if "prior" in details:
-        prior = details["prior"]
-        chosen = _CHOSEN.get(prior.get("chosen_by", ""), "as set")
-        active = ", ".join(details["active"])
-        notes += [
-            "The prior is the distance from the URDF's values by the divergence of the "
-            f"pseudo-inertias (entropic); its weight is {prior['weight']:.3g}, {chosen}.",
-            f"Active constraints: {active}." if active else "No constraint is active.",
-        ]
-        if details["relaxed"]:
-            notes.append(f"Extents that contradict the data: {', '.join(details['relaxed'])}.")
-        if details["pinned"]:
-            notes.append(f"Fixed at the URDF's values: {', '.join(details['pinned'])}.")
-    return notes
+    notes = [f"Inconsistent, with the smallest eigenvalue: {listed(wrong)}."] if wrong else []
+    for key, words in _CONSTRAINTS.items():
+        if key in details:
+            notes.append(f"{words}: {listed(details[key])}.")
+    is_consistent = identification.is_consistent
+    every = "All bodies and drives are" if is_consistent else "Not all bodies and drives are"
+    return block("report.consistency", all=every, notes=paragraphs(notes))
 
 
 def open_section(identification: TorqueIdentification) -> str:
-    """Return the parameters that the data do not determine."""
+    """Return the parameters that the data do not determine, and indistinguishable ones."""
     names, sources = identification.model.layout.names, identification.sources
     fixed = [name for name, source in zip(names, sources, strict=True) if source == "prior"]
-    without_effect = identification.mapping.unidentifiable
+    groups = identification.determination.merged
+    html = block("report.indistinguishable") if groups else ""
+    for group in groups:
+        combinations = map(str, group.combinations)
+        html += block("report.group", names=_codes(group.names), sums=_codes(combinations, "<br>"))
     return block(
         "report.open",
         rank=identification.determination.rank,
         count=len(identification.base),
-        groups=_indistinguishable(identification),
-        lists=_names("Parameters without effect on the torque", without_effect)
-        + _names("Standard parameters that remain at the URDF's values", fixed),
+        groups=html,
+        without_effect=_codes(identification.mapping.unidentifiable),
+        fixed=_codes(fixed),
     )
 
 
-def _indistinguishable(identification: TorqueIdentification) -> str:
-    """Return indistinguishable base parameters, and their identifiable combinations."""
-    groups = identification.determination.merged
-    html = block("report.indistinguishable") if groups else ""
-    for group in groups:
-        names = ", ".join(code(name).html for name in group.names)
-        sums = "<br>".join(code(str(combination)).html for combination in group.combinations)
-        html += f'<p class="code">{names}</p>\n<p>Identifiable: {sums or "none"}</p>\n'
-    return html
+def _codes(names: Iterable[str], between: str = ", ") -> str:
+    return between.join(code(name).html for name in names) or "none"
 
 
-def _names(title: str, names: Sequence[str]) -> str:
-    words = ", ".join(code(name).html for name in names) or "none"
-    return f'<h3>{title}</h3>\n<p class="code">{words}</p>\n'
-
-
-def settings_tables(identification: TorqueIdentification) -> str:
-    """Return the tables of the settings, as used."""
-    model, estimate = identification.model, identification.estimate
-    settings = identification.estimator.to_dict()
-    pairs = {
-        "estimator": settings.pop("name"),
-        **{key.replace("_", " "): str(value) for key, value in settings.items()},
-        "solver": f"{estimate.message} ({estimate.n_iter} iterations)",
-        "drive terms": listed(model.layout.terms),
-        "gravity [m/s²]": listed(f"{g:g}" for g in model.pin_model.gravity.linear.tolist()),
-        "base": "floating" if model.free_flyer else "fixed",
-        "joints": listed(model.joints),
-        "locked joints": listed(f"{k} = {v:g}" for k, v in model.locked.items()),
-    }
-    for coupling in model.layout.couplings:
-        ratios = listed(f"{joint} × {ratio:g}" for joint, ratio in coupling.ratios)
-        pairs[f"coupling {coupling.name}"] = ratios
-    signals = []
-    for evaluation in (*identification.fitted, *identification.validation):
-        own = evaluation.recording.signals
-        cutoff = "none" if own.cutoff is None else f"{own.cutoff:g} Hz, order {own.order}"
-        signals.append({**vars(own), "name": evaluation.recording.name, "filter": cutoff})
-    title = "Signals, as used for each log; minimum speed in rad/s or m/s"
-    return pairs_table("Model and estimator", pairs) + listing(title, _SIGNALS, signals)
-
-
-def pairs_table(caption: str, pairs: Mapping[str, str], heads: Sequence[str] = ()) -> str:
-    """Return a table of names and their values."""
-    rows = [[text(key), text(value)] for key, value in pairs.items()]
-    return table(caption, heads or ["setting", "value"], rows)
-
-
-def input_table(inputs: Iterable[Mapping[str, Any]]) -> str:
-    """Return the table of the input files."""
+def sources_of(found: Identification) -> dict[str, tuple[str, str]]:
+    """Return the parts of an appendix on the files read and the versions that ran."""
     rows = [
         {
             **entry,
             "role": _ROLES[entry["role"]],
             "sha256": entry["sha256"] or "not read from a file",
         }
-        for entry in inputs
+        for entry in input_entries(found)
     ]
-    return listing("Files read", _INPUTS, rows)
-
-
-def version_table(ran: Mapping[str, str]) -> str:
-    """Return the table of the versions that ran."""
-    return pairs_table("Versions that ran", ran, ["what", "version"])
+    ran = [[text(name), text(version)] for name, version in versions().items()]
+    return {
+        "inputs": ("Inputs", listing("Files read", _INPUTS, rows)),
+        "versions": ("Versions", table("Versions that ran", ["what", "version"], ran)),
+    }
 
 
 def variation_section(variation: Variation | None, torques: Mapping[str, str]) -> str:
@@ -370,7 +267,6 @@ def variation_section(variation: Variation | None, torques: Mapping[str, str]) -
 
 
 def _varying(parameter: VaryingParameter, different: Collection[tuple[int, str]]) -> dict[str, Any]:
-    """Return the row of a parameter: its value in each log, and the prediction of the next."""
     prediction = parameter.prediction
     mean, error = with_error(prediction.mean, prediction.std_error)
     low, high = (with_error(float(x), prediction.std_error)[0] for x in prediction.ends)

@@ -1,1 +1,1 @@
-"""The replay in a browser, of a log or live."""
+"""The replay of a log in a browser."""

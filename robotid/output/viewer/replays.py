@@ -6,6 +6,7 @@ no process, socket or port is needed.
 
 import itertools
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
@@ -22,87 +23,63 @@ from robotid.base.files import write_text
 from robotid.base.settings import is_number, require_each, require_kind
 from robotid.base.typing import Array, real_numbers
 from robotid.output.pages.html import asset, scaffold
-from robotid.output.viewer.scene import Scene, coordinates, mass_marks, packed, robot_scene
+from robotid.output.viewer.scene import coordinates, mass_marks, packed, robot_scene
 from robotid.robot.model import RobotModel
 
-_KEYS = 500_000  # numbers of a motion: about 3 MB
-_POINTS = 1_000_000  # numbers of all plots: about 6 MB
+_ASSETS = Path(__file__).parent / "assets"
+_SCRIPTS = (
+    *("data", "scene", "masses", "arcs", "strip", "choice", "plots"),
+    *("clock", "picking", "controls", "embed", "start"),
+)
+_NUMBERS = 500_000  # of a motion, or of all plots: about 3 MB
 _BINS = 480  # columns of the heat strip
 _PLOT_RATE = 50.0  # [Hz] points of a plot per second
 _DATA_RANGE = 100  # poses that determine the camera's view
-_CELLS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # [m] of the grid, 40 by 40
 _GAP = 0.25  # [s] a longer time without samples is a gap ...
 _TIMES = 5.0  # ... if it is this multiple of the typical one
 
 
 @dataclass(frozen=True, eq=False)
 class Torques:
-    """Torques to plot with a motion, or positions of position-controlled drives.
+    """Torques to plot with a motion, or positions of position-controlled drives."""
 
-    Attributes:
-        t: Times on the clock of the motion, shape (N,) [s].
-        measured: Measured torques, shape (N, n) [N m or N].
-        predicted: Predicted torques by the name of the model, shape (N, n) each, NaN where there
-            is no prediction; arcs, links and the heat strip show the residual of the first, until
-            another is selected.
-        noise: Scale of the residuals, shape (n,): the RMS residual of each joint on the fitted
-            logs of the first model; the RMS torque if None. Of positions: the RMS error of the
-            command.
-        quantity: "torque" or "position", whose units are the joints' [rad or m].
-    """
-
-    t: Array
-    measured: Array
+    t: Array  # (N,), times on the clock of the motion [s]
+    measured: Array  # (N, n) [N m or N]
+    # predicted torques by the name of the model, (N, n) each, NaN where there is no prediction;
+    # arcs, links and the heat strip show the residual of the first, until another is selected
     predicted: Mapping[str, Array] = field(default_factory=dict)
+    # scale of the residuals, (n,): the RMS residual of each joint on the fitted logs of the first
+    # model, the RMS torque if None; of positions, the RMS error of the command
     noise: Array | None = None
-    quantity: str = "torque"
+    quantity: str = "torque"  # or "position", whose units are the joints' [rad or m]
 
 
 @dataclass(frozen=True, eq=False)
 class Bands:
-    """Parameters over time, from a recursive estimator.
+    """Parameters over time, from a recursive estimator."""
 
-    Attributes:
-        t: Times on the clock of the motion, shape (K,) [s].
-        names: Names of the b parameters, as ``forearm.mcx``.
-        units: Their units.
-        theta: Their values, shape (K, b).
-        std_error: Their standard errors, shape (K, b).
-    """
-
-    t: Array
-    names: Sequence[str]
+    t: Array  # (K,), times on the clock of the motion [s]
+    names: Sequence[str]  # of the b parameters, as ``forearm.mcx``
     units: Sequence[str]
-    theta: Array
-    std_error: Array
+    theta: Array  # (K, b), values
+    std_error: Array  # (K, b)
 
 
 @dataclass(frozen=True)
 class Mark:
-    """An event on the time line.
+    """An event on the time line."""
 
-    Attributes:
-        t: Its time, on the clock of the motion [s].
-        label: Its description.
-        kind: "payload", "contact", "gap" or "note".
-        joint: The affected joint, if any.
-    """
-
-    t: float
+    t: float  # on the clock of the motion [s]
     label: str
-    kind: str = "note"
-    joint: str = ""
+    kind: str = "note"  # "payload", "gap" or "note"
+    joint: str = ""  # the affected joint, if any
 
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """A page that plays a motion; a notebook shows it as the value of a cell.
+    """A page that plays a motion; a notebook shows it as the value of a cell."""
 
-    Attributes:
-        data: Content of the page, in plain values.
-    """
-
-    data: Mapping[str, Any]
+    data: Mapping[str, Any]  # content of the page, in plain values
 
     @cached_property
     def html(self) -> str:
@@ -176,74 +153,32 @@ def replay(
     _check(t, q, rate)
     moved = _moved(model, t, q, rate)
     others = dict(ghosts or {})
-    for label, own in others.items():
+    for label, path in others.items():
         require_each([label], str, "the label of a ghost", "text")
-        if len(require_each(own, np.ndarray, f"ghost {label!r}", "two arrays, t and q")) != 2:
-            raise SettingsError(f"ghost {label!r} has {len(own)} arrays, wanted two, t and q")
-        _check(*own, rate)
-    gaps = gap_marks(t)
-    start = float(t[0])
+        if len(require_each(path, np.ndarray, f"ghost {label!r}", "two arrays, t and q")) != 2:
+            raise SettingsError(f"ghost {label!r} has {len(path)} arrays, wanted two, t and q")
+        _check(*path, rate)
+    gaps = [Mark(float(t[k]), f"gap of {t[k + 1] - t[k]:.2f} s", "gap") for k in _gaps(t)]
     scene = robot_scene(model)
-    data = _data(
-        model,
-        scene,
-        [q, *(own for _, own in others.values())],
-        start=start,
-        log=log,
-        motion=_packed_motion(*moved),
-        ghosts=[
-            {"label": label, **_packed_motion(*_moved(model, *own, rate))}
-            for label, own in others.items()
+    motions = [q, *(path for _, path in others.values())]
+    data = {
+        "title": model.name,
+        "scene": scene.content,
+        "start": float(t[0]),
+        "log": log,
+        "motion": _packed_motion(*moved),
+        "ghosts": [
+            {"label": label, **_packed_motion(*_moved(model, *path, rate))}
+            for label, path in others.items()
         ],
-        masses=[mass_marks(model, pi, label) for label, pi in (masses or {}).items()],
-        torques=None if torques is None else _torque_data(model, torques, t),
-        bands=None if bands is None else _band_data(bands, start),
-        marks=[
-            {"t": mark.t, "label": mark.label, "kind": mark.kind, "joint": mark.joint}
-            for mark in sorted((*marks, *gaps), key=lambda mark: mark.t)
-        ],
-        notes=[*notes, *_fixed_base(model), *(f"{note}." for note in scene.notes)],
-    )
+        "masses": [mass_marks(model, pi, label) for label, pi in (masses or {}).items()],
+        "torques": None if torques is None else _torque_data(model, torques, t),
+        "bands": None if bands is None else _band_data(bands, float(t[0])),
+        "marks": [vars(mark) for mark in sorted((*marks, *gaps), key=lambda mark: mark.t)],
+        "notes": [*notes, *_fixed_base(model), *(f"{note}." for note in scene.notes)],
+        "view": _view(model, scene.corners, motions),
+    }
     return Replay(data)
-
-
-def live_page(
-    model: RobotModel, names: Sequence[str], units: Sequence[str], q: Array, masses: Array
-) -> str:
-    """Return a page that receives events from the relative address ``events``, and draws them.
-
-    q (N, n) [rad or m], masses (p,).
-    """
-    empty = np.zeros((0, 0))
-    return page(
-        _data(
-            model,
-            robot_scene(model),
-            [q],
-            start=0.0,
-            log="",
-            motion=_packed_motion(np.zeros(0), empty),
-            ghosts=[],
-            masses=[mass_marks(model, masses, "URDF")],
-            torques=_torque_rows(model, ["measured", "predicted"]),
-            bands={"names": list(names), "units": list(units), "t": None, "values": None},
-            marks=[],
-            notes=[],
-            live=True,
-        )
-    )
-
-
-def _data(
-    model: RobotModel,
-    scene: Scene,
-    motions: Sequence[Array],
-    *,
-    live: bool = False,
-    **content: Any,  # noqa: ANN401
-) -> dict[str, Any]:
-    view = _view(model, scene.corners, motions)
-    return {"title": model.name, "live": live, "scene": scene.content, **content, "view": view}
 
 
 def _check_masses(model: RobotModel, label: str, pi: Array) -> None:
@@ -288,13 +223,7 @@ def _keyframes(t: Array, rate: float, most: int) -> Array:
     return rows
 
 
-def gap_marks(t: Array) -> list[Mark]:
-    """Return a mark for each gap of a recording, at the last sample before it: t (N,) [s]."""
-    return [Mark(float(t[k]), f"gap of {t[k + 1] - t[k]:.2f} s", "gap") for k in _gaps(t)]
-
-
 def _gaps(t: Array) -> list[int]:
-    """Return the samples before gaps of the recording."""
     steps = np.diff(t)
     return np.flatnonzero((steps > _GAP) & (steps > _TIMES * np.median(steps))).tolist()
 
@@ -309,7 +238,7 @@ def _moved(model: RobotModel, t: Array, q: Array, rate: float) -> tuple[Array, A
     if base:  # a quaternion and its negative are one pose, but not between keyframes
         turn = (q[1:, 3:7] * q[:-1, 3:7]).sum(axis=1) < 0
         q[1:, 3:7] *= np.where(np.cumsum(turn) % 2, -1.0, 1.0)[:, None]
-    rows = _keyframes(t, rate, _KEYS // q.shape[1])
+    rows = _keyframes(t, rate, _NUMBERS // q.shape[1])
     return t[rows] - t[0], coordinates(model, q[rows])
 
 
@@ -335,9 +264,11 @@ def _torque_data(model: RobotModel, torques: Torques, t: Array) -> dict[str, Any
     noise = rms if torques.noise is None else np.asarray(torques.noise, dtype=float)
     if noise.shape != wanted[1:]:
         raise DataError(f"noise has shape {noise.shape}, wanted {wanted[1:]}")
+    units = model.row_units[-len(model.joints) :]
     full, unit = (0.5, "RMS torque") if torques.noise is None else (6.0, "RMS noise")
     if torques.quantity == "position":
         full, unit = 0.25, "RMS command error"
+        units = tuple("m" if joint in model.layout.prismatic else "rad" for joint in model.joints)
     scale = {"of": np.where(noise > 0, noise, 1.0).tolist(), "full": full, "unit": unit}
     edges = np.linspace(t[0], t[-1], min(_BINS, max(len(torques.t) // 4, 1)) + 1)
     switched = series[1:] if torques.quantity == "torque" else series[1:2]
@@ -345,7 +276,12 @@ def _torque_data(model: RobotModel, torques: Torques, t: Array) -> dict[str, Any
     strips = [packed(_coded(level, np.array(scale["of"])), "<u2") for level in levels]
     times, values = _plotted(torques.t - t[0], np.hstack(series))
     return {
-        **_torque_rows(model, labels, torques.quantity),
+        "quantity": torques.quantity,
+        "joints": [
+            {"name": name, "unit": unit, "node": int(model.pin_model.getJointId(name))}
+            for name, unit in zip(model.joints, units, strict=True)
+        ],
+        "labels": labels,
         "scale": scale,
         "strips": strips,
         "t": packed(times),
@@ -370,27 +306,6 @@ def _coded(levels: Array, of: Array) -> Array:
     return np.where(np.isnan(levels), 65_535, np.where(levels < 0, 65_534, hundredths))
 
 
-def _torque_rows(
-    model: RobotModel, labels: Sequence[str], quantity: str = "torque"
-) -> dict[str, Any]:
-    """Return joints and labels of the plots, without times, values and the floating base."""
-    tree, units = model.pin_model, model.row_units[-len(model.joints) :]
-    if quantity == "position":
-        units = tuple("m" if joint in model.layout.prismatic else "rad" for joint in model.joints)
-    return {
-        "quantity": quantity,
-        "joints": [
-            {"name": name, "unit": unit, "node": int(tree.getJointId(name))}
-            for name, unit in zip(model.joints, units, strict=True)
-        ],
-        "labels": labels,
-        "scale": None,
-        "strips": [],
-        "t": None,
-        "values": None,
-    }
-
-
 def _band_data(bands: Bands, start: float) -> dict[str, Any]:
     t, values = _plotted(bands.t - start, np.hstack([bands.theta, bands.std_error]))
     names = {"names": list(bands.names), "units": list(bands.units)}
@@ -399,7 +314,7 @@ def _band_data(bands: Bands, start: float) -> dict[str, Any]:
 
 def _plotted(t: Array, values: Array) -> tuple[Array, Array]:
     """Return the samples of a plot, with a row of NaN in each gap."""
-    rows = _keyframes(t, _PLOT_RATE, _POINTS // max(values.shape[1], 1))
+    rows = _keyframes(t, _PLOT_RATE, _NUMBERS // max(values.shape[1], 1))
     holes = np.array(_gaps(t), dtype=int)
     rows = np.unique(np.r_[rows, holes, holes + 1])
     after = np.searchsorted(rows, holes) + 1
@@ -424,69 +339,16 @@ def _view(model: RobotModel, corners: Sequence[Array], motions: Sequence[Array])
     towards = np.array([d for d in itertools.product((-1, 0, 1), repeat=3) if any(d)], dtype=float)
     outermost = places[np.unique((places @ towards.T).argmax(axis=0))]
     radius = float(np.linalg.norm(np.ptp(places, axis=0)) / 2) or 0.1
-    # the camera is 2.8 radii away; the grid ends before it
-    cell = max((c for c in _CELLS if 20 * c <= 2.5 * radius), default=_CELLS[0])
+    # the camera is 2.8 radii away; the grid of 40 by 40 cells ends before it
+    decade = 10.0 ** math.floor(math.log10(radius / 8.0))
+    cell = max(step for step in (decade, 2.0 * decade, 5.0 * decade) if step <= radius / 8.0)
     # the ground is at 0, or below a robot that extends below 0
     ground = lowest if lowest < -0.1 * radius else 0.0
     return {"points": outermost.tolist(), "radius": radius, "cell": cell, "ground": ground}
 
 
-_WINDOW = 0.2  # [s] averaging window of a residual
-_ABOVE = 6.0  # unexplained: a mean residual above this multiple of its median ...
-_SHARE = 0.3  # ... and above this share of the joint's torque
-_APART = 1.0  # [s] closer segments are merged
-_SHORTEST = 0.05  # [s] shorter segments are spikes
-
-
-@dataclass(frozen=True)
-class Unexplained:
-    """A segment of unexplained torque."""
-
-    start: float  # its start [s]
-    end: float  # its end [s]
-    joint: str  # the joint with the largest residual relative to its torque
-    residual: float  # largest mean residual of that joint [N m or N]
-
-
-def find_unexplained(
-    t: Array, tau: Array, predicted: Array, joints: Sequence[str]
-) -> tuple[Unexplained, ...]:
-    """Return the segments with an exceptional difference of measured and predicted torque.
-
-    The RMS residual of a joint over 0.2 s is unexplained if it is above six times its median over
-    the motion and above 0.3 of the RMS torque, for 0.05 s or longer.
-
-    t (N,) [s], tau (N, n) [N m or N], predicted (N, n).
-    """
-    if len(t) < 2:
-        return ()
-    width = max(1, round(_WINDOW / float(np.median(np.diff(t)))))
-    square = (tau - predicted) ** 2
-    level = np.sqrt(_running_mean(square, width))  # (N, n)
-    known = np.isfinite(level)
-    columns = zip(level.T, known.T, strict=True)
-    median = np.array([np.median(x[k]) if k.any() else np.inf for x, k in columns])
-    size = np.sqrt(np.mean(tau**2, axis=0))
-    share = np.where(known, level, 0.0) / np.maximum(size, 1e-12)
-    is_large = known & (level > _ABOVE * median) & (share > _SHARE)
-    rows = np.flatnonzero(is_large.any(axis=1))
-    if not len(rows):
-        return ()
-    found = []
-    for part in np.split(rows, np.flatnonzero(np.diff(t[rows]) > _APART) + 1):
-        start, end = float(t[part[0]]), float(t[part[-1]])
-        if end - start < _SHORTEST:
-            continue
-        k, j = divmod(int(np.argmax(np.where(is_large, share, 0.0)[part])), len(joints))
-        found.append(Unexplained(start, end, joints[j], float(level[part[k], j])))
-    return tuple(found)
-
-
 def residual_levels(edges: Array, t: Array, residual: Array) -> Array:
-    """Return the RMS residual of each joint in each segment of time.
-
-    edges (B + 1,) [s], t (N,) [s], residual (N, n) -> (B, n).
-    """
+    """Return the RMS (B, n) of residuals (N, n) at t (N,) between edges (B + 1,) of time."""
     bins = len(edges) - 1
     which = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, bins - 1)
     samples = np.bincount(which, minlength=bins)
@@ -499,39 +361,14 @@ def residual_levels(edges: Array, t: Array, residual: Array) -> Array:
     return levels
 
 
-def _running_mean(values: Array, width: int) -> Array:
-    """Return the running mean without NaN; NaN if half of a window is NaN."""
-    known = np.isfinite(values)
-    sums = np.cumsum(np.vstack([np.zeros(values.shape[1]), np.where(known, values, 0.0)]), axis=0)
-    counts = np.cumsum(np.vstack([np.zeros(values.shape[1]), known]), axis=0)
-    rows = np.arange(len(values))
-    low, high = np.maximum(rows - width // 2, 0), np.minimum(rows + width // 2 + 1, len(values))
-    count = counts[high] - counts[low]
-    enough = count > width / 2
-    mean: Array = np.where(enough, (sums[high] - sums[low]) / np.maximum(count, 1), np.nan)
-    return mean
-
-
-_ASSETS = Path(__file__).parent / "assets"
-_SCRIPTS = (
-    *("data", "scene", "masses", "arcs", "strip", "choice", "plots"),
-    *("clock", "picking", "controls", "live", "embed", "start"),
-)
-_SPEEDS = (0.1, 0.25, 0.5, 1, 2, 5, 10)
-
-
 def page(data: Mapping[str, Any]) -> str:
-    """Return the page of a replay. It loads nothing, except events if it is live."""
-    title = f"{data['title']}: {'live' if data['live'] else 'replay'}"
+    """Return the page of a replay. It loads nothing."""
+    title = f"{data['title']}: replay"
     policy = "; script-src 'unsafe-inline'; img-src data: blob:"
-    policy += "; connect-src 'self'" if data["live"] else ""
     style = f"{asset('uPlot.min.css')}\n/*tones*/{asset('charts.css')}{_asset('replay.css')}"
     body = Template(_asset("replay.html")).substitute(
         title=escape(title),
         notes=" ".join(f"<p>{escape(note)}</p>" for note in data["notes"]),
-        options="".join(
-            f'<option value="{s}"{" selected" * (s == 1)}>{s}×</option>' for s in _SPEEDS
-        ),
         # "<" is an escape in JSON, so no text in it can end the script
         data=json.dumps(data, allow_nan=False).replace("<", "\\u003c"),
         viewer=_viewer(),

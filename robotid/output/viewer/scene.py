@@ -41,31 +41,27 @@ class Scene:
 
 
 def robot_scene(model: RobotModel) -> Scene:
-    """Return the nodes and the parts of a robot.
-
-    A body is drawn with the visual shapes of its links if they are found, otherwise as a
-    skeleton: capsules from its joint to the next ones, and a drum along the joint's axis.
-    """
+    """Return nodes and parts: visual shapes of the links, or capsules and drums without any."""
     tree = model.pin_model
-    library, notes = _Library(model), []
-    parts = list(library.parts)
+    parts, meshes, boxes, missing = _visuals(model)
+    notes: tuple[str, ...] = ()
     drawn = {part["node"] for part in parts}
-    if library.missing:
-        count, first = len(library.missing), library.missing[0]
-        notes.append(f"{count} meshes were not found or are not readable, for example {first}")
+    if missing:
+        words = "meshes were not found or are not readable, for example"
+        notes = (f"{len(missing)} {words} {missing[0]}",)
     for i in range(tree.njoints):
         if i not in drawn:
             parts += _skeleton(model, i)
     content = {
         "nodes": [_node(model, i) for i in range(tree.njoints)],
         "parts": parts,
-        "meshes": library.meshes,
+        "meshes": meshes,
         "reach": _reach(model),
     }
     corners = [[np.zeros((1, 3))] for _ in range(tree.njoints)]
     for part in parts:
-        corners[part["node"]].append(_corners(part, library.boxes))
-    return Scene(content, tuple(notes), tuple(map(np.vstack, corners)))
+        corners[part["node"]].append(_corners(part, boxes))
+    return Scene(content, notes, tuple(map(np.vstack, corners)))
 
 
 def coordinates(model: RobotModel, q: Array) -> Array:
@@ -119,31 +115,28 @@ def packed(values: Array, kind: str = "<f4") -> dict[str, Any]:
     return {"kind": kind, "shape": list(array.shape), "data": data}
 
 
-class _Library:
-    """The meshes of a robot, each once, and the parts that use them."""
-
-    def __init__(self, model: RobotModel) -> None:
-        self.missing: list[str] = []
-        self.meshes: list[dict[str, Any]] = []
-        self.parts: list[dict[str, Any]] = []
-        self.boxes: list[Array] = []  # the two corners of each mesh, shape (2, 3)
-        visuals = [v for v in read_shapes(model.tree.robot) if v.kind]
-        # each mesh once at each scale, with the current file
-        uses = Counter((v.file, v.size) for v in visuals if v.kind == "mesh")
-        files = {(v.file, v.size): _file(model, v) for v in visuals if v.kind == "mesh"}
-        thinned = _thinned(tuple(files.values()), tuple(uses[key] for key in files))
-        numbers: dict[tuple[str, tuple[float, ...]], list[tuple[int, Surface]]] = {}
-        for key, surfaces in zip(files, thinned, strict=True):
-            if surfaces is None:
-                self.missing.append(key[0])
-            shown = [surface for surface in surfaces or () if len(surface.faces)]
-            numbers[key] = [*enumerate(shown, len(self.meshes))]
-            for surface in shown:
-                self.boxes.append(np.array([surface.vertices.min(0), surface.vertices.max(0)]))
-                self.meshes.append(_packed_mesh(surface, self.boxes[-1]))
-        for visual in visuals:
-            which = numbers.get((visual.file, visual.size), [])
-            self.parts += _visual_parts(model, visual, which)
+def _visuals(
+    model: RobotModel,
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]], list[Array], list[str]]:
+    """Return the parts of a robot, its meshes, each once, their boxes (2, 3), and missing files."""
+    parts, meshes, boxes, missing = list[dict[str, Any]](), list[dict[str, Any]](), [], []
+    visuals = [v for v in read_shapes(model.tree.robot) if v.kind]
+    # each mesh once at each scale, with the current file
+    uses = Counter((v.file, v.size) for v in visuals if v.kind == "mesh")
+    files = {(v.file, v.size): _file(model, v) for v in visuals if v.kind == "mesh"}
+    thinned = _thinned(tuple(files.values()), tuple(uses[key] for key in files))
+    numbers: dict[tuple[str, tuple[float, ...]], list[tuple[int, Surface]]] = {}
+    for key, surfaces in zip(files, thinned, strict=True):
+        if surfaces is None:
+            missing.append(key[0])
+        shown = [surface for surface in surfaces or () if len(surface.faces)]
+        numbers[key] = [*enumerate(shown, len(meshes))]
+        for surface in shown:
+            boxes.append(np.array([surface.vertices.min(0), surface.vertices.max(0)]))
+            meshes.append(_packed_mesh(surface, boxes[-1]))
+    for visual in visuals:
+        parts += _visual_parts(model, visual, numbers.get((visual.file, visual.size), []))
+    return parts, meshes, boxes, missing
 
 
 def _file(model: RobotModel, visual: Shape) -> _File:
@@ -154,10 +147,7 @@ def _file(model: RobotModel, visual: Shape) -> _File:
 
 @lru_cache(maxsize=4)  # thinning needs seconds, and a robot has many pages
 def _thinned(files: tuple[_File, ...], uses: tuple[int, ...]) -> tuple[list[Surface] | None, ...]:
-    """Return the scaled surfaces of each file, drawn so often, thinned for a page.
-
-    None: not readable.
-    """
+    """Return each file's scaled surfaces, thinned for a page; None if it is not readable."""
     found: list[list[Surface] | None] = []
     for path, scale, _ in files:
         try:
@@ -204,18 +194,13 @@ def _visual_parts(
 
 def _corners(part: Mapping[str, Any], boxes: Sequence[Array]) -> Array:
     """Return the corners of the box about a part, in the frame of its node, shape (8, 3)."""
-    size = part["size"]
-    match part["shape"]:
-        case "mesh":
-            low, high = boxes[size[0]]
-        case "sphere":
-            low, high = np.full(3, -size[0]), np.full(3, size[0])
-        case "cylinder":
-            high = np.array([size[0], size[1] / 2, size[0]])
-            low = -high
-        case _:
-            high = np.array(size) / 2
-            low = -high
+    size, shape = part["size"], part["shape"]
+    if shape == "mesh":
+        low, high = boxes[size[0]]
+    else:
+        diameters = {"sphere": [2 * size[0]] * 3, "cylinder": [2 * size[0], size[-1], 2 * size[0]]}
+        high = np.array(diameters.get(shape, size)) / 2
+        low = -high
     box = np.array(list(itertools.product(*zip(low, high, strict=True))))
     M = np.array(part["matrix"]).reshape(4, 4).T
     moved: Array = box @ M[:3, :3].T + M[:3, 3]
@@ -272,7 +257,6 @@ def _movement(model: RobotModel, i: int) -> tuple[str, list[float]]:
 
 
 def _skeleton(model: RobotModel, joint: int) -> Iterator[dict[str, Any]]:
-    """Return the drum of a joint and the links to its children."""
     radius = _THICKNESS * _reach(model)
     skin = _LINK if joint else _BASE
     for end in _ends(model, joint):
@@ -373,11 +357,7 @@ def _thinned_solid(patches: Sequence[Surface], share: float) -> list[Surface]:
 
 
 def _simplified(V: Array, F: Array, share: float) -> Any:  # noqa: ANN401
-    """Return a share of the triangles of a patch, as a mesh; its rim is kept if it can be.
-
-    Otherwise, too many triangles would remain. The library's error bound assumes coordinates of
-    about 1.
-    """
+    """Return a share of a patch's triangles, for a size of 1; its rim is kept if few remain."""
     import fast_simplification
     import trimesh
 

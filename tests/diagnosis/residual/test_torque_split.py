@@ -22,7 +22,6 @@ from robotid.diagnosis.residual.torque_split import (
     follow,
     friction_split,
     joint_torques,
-    spectrum,
     split_torque,
 )
 from robotid.dynamics.prediction import predict, remember
@@ -157,7 +156,6 @@ def test_a_joint_is_judged_on_what_was_kept_apart(identified):
         assert torque.rms["measured"] == pytest.approx(
             measured.rmse * 100 / measured.relative_error_pct
         )
-        np.testing.assert_array_equal(torque.power, (motion.tau * motion.v)[:, j])
         np.testing.assert_allclose(
             sum(torque.parts.values()) + torque.residual, motion.tau[:, j], atol=1e-11
         )
@@ -317,7 +315,6 @@ def test_a_residual_is_examined_without_outliers_of_the_samples_used(rng):
     rms = spoilt.rms
     assert rms["measured"] == pytest.approx(np.sqrt(np.mean(tau[used] ** 2)))
     assert rms["residual"] == pytest.approx(np.sqrt(np.mean(r[used] ** 2)))
-    np.testing.assert_allclose(spoilt.power, tau * v)
 
 
 # --- how a residual follows a quantity, against sums over rows, bins and segments one by one ----
@@ -419,42 +416,7 @@ def test_even_bins_have_as_many_rows_and_are_cut_at_zero(rng):
     assert np.unique(even_bins(np.ones(5))).tolist() == [0]
 
 
-# --- spectrum against brute force and closed form; friction against the truth ----
-
-
-def test_the_spectrum_s_integral_is_the_mean_square_of_the_rows_used(rng):
-    x, segment = 3.0 * rng.standard_normal(30_000), np.repeat([0, 1], [20_000, 10_000])
-    used = rng.random(len(x)) > 0.4
-    for dt in (0.01, 0.002):
-        f, S = spectrum(x, used, segment, dt, length=200 * dt)
-        assert np.sum(S) * f[1] == pytest.approx(9.0, rel=0.03)
-        # white: half the rate holds it evenly
-        assert np.median(S) == pytest.approx(9.0 * 2 * dt, rel=0.1)
-
-
-def test_the_spectrum_equals_that_of_scipy_where_no_row_is_left_out(rng):
-    from scipy.signal import welch
-
-    x = rng.standard_normal(1000)
-    window = np.hanning(202)[1:-1]
-    ours = spectrum(x, np.ones(1000, bool), np.zeros(1000), 0.01, length=2.0)
-    theirs = welch(x, 100.0, window=window, noverlap=100, detrend=False)
-    np.testing.assert_allclose(ours[0], theirs[0], atol=1e-12)
-    np.testing.assert_allclose(ours[1], theirs[1], rtol=1e-10)
-
-
-def test_a_window_never_crosses_a_gap():
-    """Two halves of a sine whose phase turns by pi in the gap: the peak stays one line."""
-    t = np.arange(2000) / 100.0
-    x = np.sin(2 * np.pi * 5.0 * t) * np.where(t < 10.0, 1.0, -1.0)
-    f, S = spectrum(x, np.ones(2000, bool), (t >= 10.0).astype(int), 0.01, length=4.0)
-    assert f[np.argmax(S)] == pytest.approx(5.0)
-    assert S[np.abs(f - 5.0) > 1.0].max() < 1e-4 * S.max()
-
-
-def test_no_used_row_gives_no_spectrum():
-    f, S = spectrum(np.ones(50), np.zeros(50, bool), np.zeros(50), 0.01)
-    assert len(f) == len(S) == 0
+# --- friction against the truth -----------------------------------------------------------------
 
 
 def test_friction_is_the_torque_that_viscous_coulomb_and_offset_add(ur5, rng):

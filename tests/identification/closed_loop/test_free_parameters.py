@@ -17,7 +17,7 @@ from robotid.identification.closed_loop.loop_simulator import (
     measured_motion,
 )
 from robotid.identification.closed_loop.stages import stated_loops
-from robotid.output.files.commanded import loops_of
+from robotid.output.files.result_file import loops_of
 from robotid.robot.drives import Coulomb, Viscous
 from robotid.robot.parameters import pseudo_inertia
 

@@ -11,7 +11,7 @@ from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import segment_scores
 from robotid.identification.closed_loop.from_commands import loop_runs
 from robotid.identification.closed_loop.loop_simulator import FreeParameter, LoopSimulator
-from robotid.output.files.commanded import loops_of
+from robotid.output.files.result_file import loops_of
 from robotid.robot.drives import Coulomb
 
 NOISE = 1e-4  # [rad]

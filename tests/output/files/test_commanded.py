@@ -15,8 +15,9 @@ from helpers.mujoco_plant import LEG, followed, loaded, multisine, plant, record
 
 from robotid.base.exceptions import DataError
 from robotid.cli import main
-from robotid.output.files.result_file import load_result
+from robotid.output.files.result_file import limit_of, load_result
 from robotid.robot.examples import example_urdf
+from robotid.robot.tree import Joint
 
 RATE = 200.0  # [Hz] of the commands
 CHIRP = Path(os.environ.get("ROBOTID_DATA", "/none")) / "commands" / "go2" / "chirp.parquet"
@@ -112,6 +113,13 @@ def result(tmp_path_factory):
     friction = {LEG[2]: by_position(0.05, 0.3, -2.5, -1.0)}
     folder = tmp_path_factory.mktemp("results") / "leg"
     return written_result(leg, folder, position=friction, limits={LEG[0]: 21.0}), leg
+
+
+def test_a_joint_without_any_stated_effort_has_no_limit(result):
+    (drive, *_), joint = result[1].drives, Joint("j", "revolute", "a", "b")
+    for stated, effort, wanted in ((np.inf, 0.0, np.inf), (np.inf, 5.0, 5.0), (3.0, 5.0, 3.0)):
+        limited = replace(drive, effort_limit=stated)
+        assert limit_of(limited, replace(joint, effort=effort)) == wanted
 
 
 def test_encoders_that_count_the_other_way_are_heard_and_answered_in_their_sense(result):

@@ -5,33 +5,17 @@ import shutil
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.paths import ROOT
-from helpers.synthetic import exact_log, truth
 
 import robotid
 from robotid.base.exceptions import DataError
-from robotid.cli.identify import run_job
-from robotid.cli.job import read_job
-from robotid.robot.model import RobotModel
-
-URDF = ROOT / "urdf" / "planar_2r.urdf"
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory):
+def written(identified, tmp_path_factory):
     """The folder of a result, and the identification that wrote it."""
-    folder, rng = tmp_path_factory.mktemp("result"), np.random.default_rng(0)
-    model = RobotModel.from_urdf(URDF)
-    for name in ("first", "second"):
-        log = exact_log(model, truth(model), rng, samples=800, noise=0.1)
-        robotid.write_log(log, folder / f"{name}.csv")
-    (folder / "job.toml").write_text(
-        f'urdf = "{URDF}"\n[output]\nreport = false\n'
-        '[[identification]]\nlog = "first.csv"\n'
-        '[[validation]]\nlog = "second.csv"\n'
-    )
-    found, _ = run_job(read_job(folder / "job.toml"), folder / "out")
-    return folder / "out", found
+    folder = tmp_path_factory.mktemp("result") / "out"
+    robotid.save_result(identified, folder)
+    return folder, identified
 
 
 def test_a_result_has_the_robot_its_parameters_verdict_and_metrics(written):
@@ -46,7 +30,7 @@ def test_a_result_has_the_robot_its_parameters_verdict_and_metrics(written):
         assert fitted[joint]["rmse"] == pytest.approx(measured.rmse, rel=1e-12)
     for joint, measured in found.validation[0].metrics["estimate"].per_joint.items():
         assert kept[joint]["relative_error_pct"] == pytest.approx(measured.relative_error_pct)
-    assert list(result.metrics)[1].endswith("second.csv")
+    assert list(result.metrics)[1].endswith("kept.csv")
     assert repr(result) == (
         f"<Result of {found.model.name}: {len(found.base)} base parameters by consistent, verdict "
         f"{found.verdict.status}>"

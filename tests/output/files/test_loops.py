@@ -4,10 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from robotid.output.files.entries import (
-    _covariance,
-    loop_parameters,
-)
+from robotid.output.files.entries import _covariance, loop_entries, loop_parameters
 
 
 def test_each_joint_has_its_gains_with_units_and_sources(crane):
@@ -22,6 +19,11 @@ def test_each_joint_has_its_gains_with_units_and_sources(crane):
             assert (entry["source"] == "stated") == (k is None)
             error = None if k is None else crane.fit.estimate.std_error[k]
             assert entry["std_error"] == error
+
+
+def test_bodies_that_no_log_determines_are_named_as_undetermined(crane):
+    undetermined = loop_entries(crane)["ranges"]["undetermined"]  # boom.Izz is fitted
+    assert undetermined == ["boom.mcx", "boom.mcy", *crane.undetermined]
 
 
 def test_the_covariance_is_that_of_the_free_parameters_that_are_not_at_a_bound(rng):

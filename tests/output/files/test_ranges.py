@@ -12,11 +12,7 @@ from scipy.spatial.transform import Rotation
 from robotid.data.log import Trajectory
 from robotid.dynamics.friction_projection import drive_moments, project_friction
 from robotid.output.files.entries import build_result
-from robotid.output.files.ranges import (
-    parameter_ranges,
-    projected_ranges,
-    ranges_text,
-)
+from robotid.output.files.ranges import parameter_ranges, projected_ranges, ranges_text
 from robotid.robot.drives import Stribeck
 from robotid.robot.parameters import pseudo_inertia
 

@@ -272,10 +272,3 @@ def test_a_pair_that_does_not_belong_together_is_refused(source, tmp_path, rng):
     new.unlink()
     with pytest.raises(ModelError, match=r"there is no URDF file '.*new.urdf'"):
         load_identified(new, sidecar)
-
-
-def test_every_kind_of_robot_survives_the_round_trip(ur5, panda, tmp_path, rng):
-    for model in (ur5, panda):
-        pi = possible_parameters(model, rng)
-        sidecar = write_urdf(model, pi, tmp_path / "new.urdf", dynamics=True)
-        assert_same_torque(model, pi, *load_identified(tmp_path / "new.urdf", sidecar))

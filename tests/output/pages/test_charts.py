@@ -5,15 +5,7 @@ import pytest
 from helpers.browsing import until, visit
 from helpers.pages import charts
 
-from robotid.base.exceptions import DataError
-from robotid.output.pages.charts import (
-    Chart,
-    Series,
-    broken,
-    chart_html,
-    thin,
-)
-from robotid.output.pages.html import page
+from robotid.output.pages.html import Chart, Series, broken, chart_html, page, thin
 
 T = 1000.0 + np.arange(5000) / 500  # [s], the log's own time
 
@@ -49,9 +41,7 @@ def demo(torque, lines, tmp_path_factory):
     spectrum = Chart(
         "Spectrum", f, (Series("S", f**-2.0, "text"),), "f [Hz]", "S", logarithmic="xy"
     )
-    whiskers = Series("rms", np.array([3.0, -1.0]), "tone-1", "bars", half=np.array([0.5, 0.2]))
-    bars = Chart("Bars", np.arange(2.0), (whiskers,), "joint", "rms", x_names=("one", "two"))
-    first, *others = (chart_html(c, c.title) for c in (torque, below, split, spectrum, bars))
+    first, *others = (chart_html(c, c.title) for c in (torque, below, split, spectrum))
     folded = f"<details><summary>more</summary>{''.join(others[1:])}</details>"
     html = page("charts", "<h1>charts</h1>", {"a": ("Torque", first + others[0] + folded)})
     target = tmp_path_factory.mktemp("charts") / "charts.html"
@@ -81,22 +71,6 @@ def test_numbers_on_logarithmic_axes_keep_their_share(rng):
     (found,) = charts(chart_html(chart, ""))
     np.testing.assert_allclose(np.delete(found["series"][0]["y"], 3), np.delete(y, 3), rtol=3e-4)
     assert np.isnan(found["series"][0]["y"][3])
-
-
-@pytest.mark.parametrize(
-    ("series", "said"),
-    [
-        (Series("y", np.zeros(4), "text"), "series 'y' of the chart 'c' has 4 values, its x has 5"),
-        (
-            Series("y", np.zeros(5), "text", "pie"),
-            "is of kind 'pie'; kinds: line, dots, bars, area",
-        ),
-        (Series("y", np.zeros(5), "text", half=np.zeros(3)), "has 3 half widths, its x has 5"),
-    ],
-)
-def test_a_chart_that_does_not_fit_together_is_refused(series, said):
-    with pytest.raises(DataError, match=re.escape(said)):
-        Chart("c", np.arange(5.0), (series,), "x", "y")
 
 
 def test_no_name_ends_the_script_or_the_picture():
@@ -251,7 +225,7 @@ def test_every_number_and_setting_of_a_chart_is_in_its_data():
     )
     chart = Chart(
         "<t>", x, series, "x [Hz]", "y [N]", link="run 2", spans=((0.2, 0.5), (2.0, 30.0)),
-        marks=(0.3, 40.0), logarithmic="xy", height=123, x_names=("p", "q"),
+        logarithmic="xy", height=123,
     )  # fmt: skip
     (found,) = charts(chart_html(chart, ""))
     np.testing.assert_allclose(found["x"], x, rtol=1e-6)
@@ -263,10 +237,9 @@ def test_every_number_and_setting_of_a_chart_is_in_its_data():
     np.testing.assert_allclose(found["series"][0]["half"], [0.0, 0.5, 1.0, 4.0], atol=1e-4)
     assert [said["half"] is None for said in found["series"]] == [False, True, True]
     assert found["spans"] == [[0.2, 0.5], [2.0, 30.0]]
-    assert found["marks"] == [0.3, 40.0]
-    keys = ("title", "x_label", "y_label", "link", "logarithmic", "height", "x_names")
+    keys = ("title", "x_label", "y_label", "link", "logarithmic", "height")
     said = [found[key] for key in keys]
-    assert said == ["<t>", "x [Hz]", "y [N]", "run 2", "xy", 123, ["p", "q"]]
+    assert said == ["<t>", "x [Hz]", "y [N]", "run 2", "xy", 123]
 
 
 def test_of_a_thinned_line_every_extreme_and_both_sides_of_a_break_remain():

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 
 from robotid.base.findings import Finding
-from robotid.output.report.document import write_report
+from robotid.output.report.report_content import write_report
 
 FINDINGS = [
     Finding("late", "warning", "second.csv", "torque is 4 ms late"),

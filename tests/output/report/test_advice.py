@@ -21,9 +21,7 @@ from robotid.diagnosis.residual.misfit import (
     setting_of,
 )
 from robotid.diagnosis.verdict.verdict import JointVerdict, Verdict
-from robotid.estimation.fitting.drive_terms import (
-    JointMotion,
-)
+from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.output.report.next_steps import Origin, Step, _once, next_steps, sentence_of
 from robotid.robot.examples import example_urdf
@@ -216,24 +214,17 @@ def test_an_error_comes_before_a_warning_and_three_steps_are_enough(identified):
     assert words(next_steps(grave, JOB))[:2] == ["Examine", "If"]
 
 
-@pytest.mark.parametrize(
-    ("code", "evidence", "table", "flags"),
-    [
-        (
-            "current_for_torque",
-            {},
-            "[torque.gains]\nelbow_joint = GAIN",
-            "--gain elbow_joint=GAIN",
-        ),
-        (
-            "torque_delay",
-            {"delay": 0.0051},
-            "[signals]\ntorque_delay = 0.0051",
-            "--torque-delay 0.0051",
-        ),
-    ],
-)
-def test_a_setting_is_a_line_of_the_job_file_or_a_flag(identified, code, evidence, table, flags):
+SETTINGS = {
+    "current_for_torque": ({}, "[torque.gains]\nelbow_joint = GAIN", "--gain elbow_joint=GAIN"),
+    "torque_delay": (
+        {"delay": 0.0051}, "[signals]\ntorque_delay = 0.0051", "--torque-delay 0.0051"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("code", SETTINGS)
+def test_a_setting_is_a_line_of_the_job_file_or_a_flag(identified, code):
+    evidence, table, flags = SETTINGS[code]
     found = told(identified, warning(code, **evidence))
     block, *of_payload = next_steps(found, FLAGS)[0].blocks
     assert block == f"robotid identify arm.urdf first.csv --cutoff 8 {flags} --out out"

@@ -48,10 +48,7 @@ def test_a_missing_replay_is_written_by_the_command_of_the_report(browser, folde
         assert program == "robotid"
         assert main(words) == 0
         seen.page.get_by_role("button", name="Reload").click()
-        until(
-            seen,
-            f"{STATE} === 'Replay of second.csv'",
-        )
+        until(seen, f"{STATE} === 'Replay of second.csv'")
         at = float(re.search(r"t=([\d.]+)", worst.get_attribute("data-at"))[1])
         until(seen, f"Math.abs({CURSOR} - {at}) < 1e-9")
         assert frame(seen).evaluate("replay.clock.time") == pytest.approx(at)
@@ -70,10 +67,7 @@ def docked(browser, folder):
     assert main(["replay", *words]) == 0
     with visit(browser, folder / "result" / "report.html", reduced_motion="reduce") as seen:
         seen.page.get_by_role("button", name="Show the replay").click()
-        until(
-            seen,
-            f"{STATE} === 'Replay of second.csv'",
-        )
+        until(seen, f"{STATE} === 'Replay of second.csv'")
         yield seen
         assert seen.errors == []
 

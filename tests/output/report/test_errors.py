@@ -10,14 +10,14 @@ from helpers.pages import bars
 from robotid.diagnosis.verdict.verdict import GOOD, POOR
 from robotid.output.report.errors import worst_errors
 from robotid.output.report.next_steps import Origin, next_steps
+from robotid.output.report.report_content import torque_report
 from robotid.output.report.report_page import first_screen
-from robotid.output.report.torque_report import torque_report
 
 ORIGIN = Origin(("arm.toml",), "out")
 
 
 def screen_of(found, files=None):
-    return first_screen(torque_report(found, ORIGIN), files or {})
+    return first_screen(found, torque_report(found, ORIGIN), ORIGIN, files or {})
 
 
 @pytest.fixture(scope="module")

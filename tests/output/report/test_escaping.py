@@ -61,6 +61,6 @@ def test_a_status_of_another_program_is_refused_and_escaped(folder, tmp_path):
     path.write_text(json.dumps(result))
     with pytest.raises(DataError, match=r"verdict.status is .*, wanted one of good, usable"):
         read_result(path)
-    shown = [{"label": "A", "path": "", "estimator": "", "verdict": result["verdict"]}]
-    text = page("", "".join(map(comparison._verdict, range(len(shown)), shown)), {})
+    shown = {"label": "A", "name": "", "path": "", "estimator": "", "verdict": result["verdict"]}
+    text = page("", comparison._verdict(shown), {})
     assert "<script>alert" not in text

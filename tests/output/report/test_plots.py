@@ -5,8 +5,6 @@ import pytest
 from helpers.figures import torques
 from helpers.pages import chart
 
-from robotid.diagnosis.residual.torque_split import spectrum
-
 JOINTS = range(6)
 
 
@@ -78,18 +76,3 @@ def test_friction_is_drawn_against_speed(report, identified, kept, predicted, j)
     close(ours, friction[order])
     close(steady, own[0] * v[order] + own[1] * np.sign(v[order]) + own[2])
     assert known.sum() == len(known) - 1  # dry friction jumps: the line breaks where it turns
-
-
-@pytest.mark.parametrize("j", JOINTS)
-def test_the_spectrum_is_that_of_torque_and_residual(report, identified, kept, predicted, j):
-    recording = kept.recording
-    motion, used = recording.trajectory, recording.mask[:, j].astype(bool)
-    what = chart(report, f"Spectrum of torque and residual of {identified.model.joints[j]}")
-    residual = motion.tau - predicted
-    for series, x in zip(what["series"], (motion.tau[:, j], residual[:, j]), strict=True):
-        f, density = spectrum(x, used, motion.segment, 0.02)
-        shown = (f > 0) & (f <= 24.0)  # twice the cut-off
-        np.testing.assert_allclose(what["x"], f[shown], atol=1e-6)
-        np.testing.assert_allclose(series["y"], np.sqrt(density[shown]), rtol=1e-3)
-    assert what["marks"] == [12.0]
-    assert what["logarithmic"] == "y"

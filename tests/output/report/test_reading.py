@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from helpers.browsing import until, visit
 
-from robotid.output.report.document import write_report
 from robotid.output.report.next_steps import Origin
+from robotid.output.report.report_content import write_report
 
 PARAMETERS = "Parameters of links and drives"
 

@@ -8,7 +8,7 @@ import pytest
 from helpers.pages import number, percent, tables
 
 from robotid.diagnosis.residual.torque_split import joint_torques
-from robotid.output.report.torque_report import why_section
+from robotid.output.report.report_content import why_section
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from robotid.output.report.dock import Residual, worst_second
+from robotid.output.report.report_page import Residual, worst_second
 
 T = 100.0 + np.arange(1000) / 100  # [s] 10 s at 100 Hz
 

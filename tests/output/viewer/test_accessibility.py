@@ -15,7 +15,7 @@ from robotid.base.findings import Finding
 from robotid.identification.pipeline import identify
 from robotid.output.files.entries import build_result
 from robotid.output.report.comparison import write_comparison
-from robotid.output.report.document import write_report
+from robotid.output.report.report_content import write_report
 from robotid.robot.model import RobotModel
 
 AXE = {"runOnly": {"type": "tag", "values": ["wcag2a", "wcag2aa"]}}
@@ -40,10 +40,7 @@ def pages(tmp_path_factory):
 
 
 # each width and each scheme of each page, though not all four of both: axe takes a second and more
-VIEWS = {
-    "report": ((1280, "light"), (360, "dark")),
-    "compare": ((1280, "dark"), (360, "light")),
-}
+VIEWS = {"report": ((1280, "light"), (360, "dark")), "compare": ((1280, "dark"), (360, "light"))}
 
 
 @pytest.mark.parametrize("name", VIEWS)

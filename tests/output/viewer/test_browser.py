@@ -1,10 +1,6 @@
 """What only a browser can show. Pages are opened from files; nothing is fetched."""
 
 import io
-import os
-import signal
-import subprocess
-import sys
 from contextlib import contextmanager
 
 import numpy as np
@@ -12,17 +8,9 @@ import pinocchio as pin
 import pytest
 from helpers.browsing import until
 from helpers.browsing import visit as visit_large
-from helpers.paths import URDF
-from helpers.synthetic import perfect, truth
 from PIL import Image
 
-from robotid.data.files.read import write_log
-from robotid.data.log import Log
-from robotid.dynamics.simulation.motions import random_fourier
-from robotid.dynamics.simulation.simulation_settings import Payload, Sensors
-from robotid.dynamics.simulation.simulator import Noise
 from robotid.output.viewer.replays import Bands, Mark, Torques, replay
-from robotid.robot.model import RobotModel
 
 T = np.arange(401) / 100.0 + 7.0  # [s]
 OPEN = {"reduced_motion": "reduce"}  # opens with the clock stopped
@@ -92,12 +80,6 @@ def playing(opened):
     yield opened
     opened.page.evaluate("replay.pause()")
     assert opened.errors == []
-
-
-@pytest.fixture(scope="module")
-def planar():
-    """A robot without meshes, where it does not matter which: it is drawn faster."""
-    return RobotModel.from_urdf(URDF / "planar_2r.urdf")
 
 
 @contextmanager
@@ -355,83 +337,3 @@ def test_axe_finds_no_fault(browser, page):
             assert len(found["passes"]) > 10 or scheme == "dark"
             assert found["passes"]
         assert seen.errors == []
-
-
-# the command as it is, but the page is told nothing after 3 s of the log until a file is there
-
-
-HELD = """
-import pathlib, runpy, signal, time
-signal.signal(signal.SIGINT, signal.default_int_handler)  # whatever the shell of the tests ignores
-from robotid.output.viewer.server import LivePage
-send = LivePage.send
-def held(self, message):
-    while message.get("t", 0.0) > 3.0 and not pathlib.Path("go on").exists():
-        time.sleep(0.02)
-    send(self, message)
-LivePage.send = held
-runpy.run_module("robotid", run_name="__main__", alter_sys=True)
-"""
-
-
-def test_the_live_page_follows_a_running_tracker_and_ends_on_ctrl_c(browser, planar, tmp_path):
-    rng = np.random.default_rng(0)
-    load = Payload("link_2", 2.0, (1.5, 0.0, 0.0), inertia=(0.01, 0, 0.01, 0, 0, 0.01), start=8.0)
-    log = perfect(
-        planar, truth(planar), random_fourier(planar, rng, period=5.0), rng, rate=100.0,
-        duration=10.0, sensors=Sensors(noise=Noise(q=2e-5, tau=0.02)), payload=load,
-    )  # fmt: skip
-    kept = (log.t <= 5.0) | (log.t >= 5.6)
-    log = Log(log.t[kept], log.q[kept], log.tau[kept], planar.joints)
-    write_log(log, tmp_path / "log.csv")
-    words = ["track", str(planar.tree.path), "log.csv"]
-    run = subprocess.Popen(
-        [sys.executable, "-c", HELD, *words, "--out", "out", "--serve", "--speed", "10"],
-        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env=os.environ | {"PYTHONUNBUFFERED": "1"},
-    )  # fmt: skip
-    try:
-        address = run.stderr.readline().split()[1]
-        assert address.startswith("http://127.0.0.1:")
-        with visit(browser, address) as seen:
-            until(seen, "replay.clock.time > 1.5", 120.0)
-            assert seen.page.locator("#state").inner_text() == "live"
-            early = seen.page.evaluate("replay.clock.time")
-            assert early <= 3.0
-            (tmp_path / "go on").touch()
-            until(seen, "document.getElementById('state').textContent.includes('finished')", 120.0)
-            # the page shows the last pose of the log
-            assert seen.page.evaluate("replay.clock.time") == pytest.approx(10.0, abs=0.05)
-            data = planar.pin_model.createData()
-            pin.forwardKinematics(planar.pin_model, data, log.q[-1])
-            np.testing.assert_allclose(poses(seen)[-1], data.oMi[-1].homogeneous, atol=0.05)
-            assert "step change" in seen.page.locator("#marks").inner_text()
-            # those out of sight, too: no news will draw them when they are scrolled to
-            until(seen, "charts.all.every((chart) => chart.x.length > 100)")
-            assert "5.00 s: gap of 0.60 s" in seen.page.locator("#marks").inner_text()
-            drawn = seen.page.evaluate("charts.all.map(({x, ys}) => [x, ys[0]])")
-            assert len(drawn) > 2
-            for chart in drawn:  # without a line across the gap
-                x, y = np.array(chart, dtype=float)
-                assert (np.diff(x) > 0).all()
-                k = int(np.searchsorted(x, 5.0))
-                assert (x[k], np.isnan(y[k])) == (5.0, True)
-                assert 5.6 < x[k + 1] < 7.0
-            kept = seen.page.evaluate("""() => { // a table with every second row left out
-              const table = new replay.motion.constructor();
-              for (let k = 0; k <= 20000; k++) table.push(0.5 * k, [k === 7 ? NaN : k]);
-              return [table.t.slice(0, 6), table.t.length];
-            }""")
-            assert kept == [[0.0, 1.0, 2.0, 3.0, 3.5, 4.0], 10002]
-            assert seen.errors == []
-            assert seen.requests == [f"{address}events"]
-        assert (tmp_path / "out" / "track.json").is_file()
-        run.send_signal(signal.SIGINT)
-        assert run.wait(60) == 0
-        assert "Traceback" not in run.stderr.read()
-        assert "step change at" in run.stdout.read()
-    finally:
-        run.kill()
-        run.wait()
-        run.stderr.close()
-        run.stdout.close()

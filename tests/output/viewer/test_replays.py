@@ -6,7 +6,7 @@ import pytest
 from helpers.replay_data import leave_out_meshes, shown
 
 from robotid.base.exceptions import DataError
-from robotid.output.viewer.replays import Torques, replay
+from robotid.output.viewer.replays import Torques, replay, residual_levels
 from robotid.robot.model import RobotModel
 
 URDF = """<robot name="&lt;b&gt;x&lt;/b&gt;">
@@ -99,20 +99,13 @@ def test_every_keyframe_is_the_robot_s_pose(arm, motion, page):
             np.testing.assert_allclose(pose.homogeneous, true.homogeneous, atol=1e-6)
 
 
-def test_torques_are_plotted_with_gaps_and_by_the_name_of_who_predicts(arm, motion):
+def test_torques_are_plotted_with_gaps_and_the_units_of_their_joints(arm, motion):
     t, q = motion
     t = np.where(t > 6.0, t + 1.0, t)
-    ours = Torques(t, q + 1.0, {"fit": q})
-    data = shown(replay(arm, t, q, torques=ours).html)["torques"]
-    assert data["labels"] == ["measured", "fit"]
-    assert [j["name"] for j in data["joints"]] == ["turn/1", "slide"]
-    assert [j["unit"] for j in data["joints"]] == ["N m", "N"]
-    assert [j["node"] for j in data["joints"]] == [1, 2]
-    holes = np.flatnonzero(np.isnan(data["values"][:, 0]))
-    assert len(holes) == 1
-    assert 1.0 < data["t"][holes[0]] < 2.0
-    residual = np.delete(data["values"][:, :2] - data["values"][:, 2:], holes, axis=0)
-    np.testing.assert_allclose(residual, 1.0, atol=4e-4)  # steps of a 65,534th of 12 N m
+    data = shown(replay(arm, t, q, torques=Torques(t, q + 1.0, {"fit": q})).html)["torques"]
+    assert [(j["unit"], j["node"]) for j in data["joints"]] == [("N m", 1), ("N", 2)]
+    (hole,) = np.flatnonzero(np.isnan(data["values"][:, 0]))
+    assert 1.0 < data["t"][hole] < 2.0
 
 
 def test_every_series_is_that_of_its_joint_and_of_who_says_so(identified):
@@ -192,3 +185,11 @@ def test_what_does_not_fit_is_refused(arm, motion, tmp_path, change, message):
     with pytest.raises(DataError, match=message):
         replay(arm, *change(*motion)).write(tmp_path / "r.html")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_levels_are_root_mean_squares_and_say_where_there_is_nothing():
+    t = np.r_[0.1, 0.3, 0.6, 0.9, 1.2, 3.0]
+    residual = np.array([[3.0, 1], [4.0, np.nan], [-1, np.nan], [1, np.nan], [2, -5], [7, 0]])
+    levels = residual_levels(np.array([0.0, 0.5, 1.0, 2.0, 2.5, 3.0]), t, residual)
+    wanted = [[np.sqrt(12.5), 1], [1, -1], [2, 5], [np.nan, np.nan], [7, 0]]
+    np.testing.assert_allclose(levels, wanted)

@@ -118,7 +118,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     this.what = what;
     this.link = link(what.link);
     this.hidden = new Set(what.series.flatMap(({ hidden }, i) => (hidden ? [i] : [])));
-    this.below = (what.x_label ? 56 : 36) + this.slant(); // [px] that the x axis takes
+    this.below = what.x_label ? 56 : 36; // [px] that the x axis takes
     this.plot = null;
     this.index = -1; // row under the cursor
     this.keys = element("div", { class: "keys" }, element("span", {}, what.y_label));
@@ -141,12 +141,6 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     sight.observe(this.place);
     this.resized = new ResizeObserver(() => this.fit());
     this.resized.observe(this.place);
-  }
-
-  slant() { // room [px] that names at ticks need below because they are too long to be upright
-    const { x_names: names } = this.what;
-    const longest = Math.max(0, ...(names || []).map((name) => 6.2 * name.length));
-    return names && longest * names.length > 420 ? Math.round(longest / 2) : 0;
   }
 
   key(series, i) { // the legend's button of a series; it hides and shows it
@@ -194,7 +188,6 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
       for (let k = 0; k < size; k += 1) {
         const margin = half && Number.isFinite(half[k]) ? half[k] : 0;
         [low[k], high[k]] = [y[k] - margin, y[k] + margin];
-        if (kind === "bars") [low[k], high[k]] = [Math.min(0, low[k]), Math.max(0, high[k])];
         if (kind === "area") {
           [low[k], high[k]] = [down[k] + Math.min(0, y[k] || 0), up[k] + Math.max(0, y[k] || 0)];
         }
@@ -212,11 +205,8 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     if (this.link.range) return this.link.range;
     if (this.link.whole) return this.link.whole;
     const first = this.x[0], last = this.x[this.x.length - 1];
-    const { series, x_names: names } = this.what;
-    const wide = series.some(({ kind }) => kind === "bars") || (names && names.length);
-    const room = wide && this.x.length > 1 ? 0.5 * (last - first) / (this.x.length - 1) : 0;
     if (first === last) return [first - 0.5, last + 0.5];
-    return this.x.length ? [first - room, last + room] : [0, 1];
+    return this.x.length ? [first, last] : [0, 1];
   }
 
   extent() { // of y in the window
@@ -273,7 +263,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
   // ---- drawing ----
 
   draw() {
-    const { series, logarithmic, height, x_label: name, x_names: names } = this.what;
+    const { series, logarithmic, height, x_label: name } = this.what;
     const distribution = (axis) => (logarithmic.includes(axis) ? 3 : 1);
     const axis = (extra) => ({ stroke: () => tone("text"), font: "11px system-ui, sans-serif",
       grid: { stroke: () => tone("line"), width: 1 }, values: tickWords, incrs: STEPS,
@@ -281,10 +271,6 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     const decades = (is) => (logarithmic.includes(is) ? { filter: (_, splits) => splits,
       splits: (u, i, low, high) => powers(low, high),
       values: (_, splits) => splits.map((v) => words(v)) } : {});
-    const slant = this.slant();
-    const named = names && names.length ? { splits: () => names.map((_, k) => k),
-      values: () => names, filter: (_, splits) => splits, grid: { show: false },
-      ...(slant ? { rotate: 30, size: 28 + slant } : {}) } : {};
     this.plot = new uPlot({
       width: Math.max(this.place.clientWidth, 120), height: height + this.below, padding: [8, 10, 0, 0],
       legend: { show: false },
@@ -294,7 +280,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
       scales: { x: { time: false, distr: distribution("x"), range: () => this.window() },
         y: { distr: distribution("y"), range: () => this.extent() } },
       axes: [axis({ size: 28, label: name || null, labelSize: name ? 20 : 0, labelGap: 2, space: 70,
-        labelFont: "11px system-ui, sans-serif", ...decades("x"), ...named }),
+        labelFont: "11px system-ui, sans-serif", ...decades("x") }),
       axis({ size: 54, space: 22, ...decades("y") })],
       series: [{}, ...series.map(({ tone: colour, kind, faint }, i) => ({ show: !this.hidden.has(i),
         stroke: () => tone(colour), width: 1.3, alpha: faint ? FAINT : 1, points: { show: false },
@@ -340,11 +326,10 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
       const opacity = series.faint ? FAINT : 1;
       ctx.globalAlpha = opacity;
       if (series.kind === "dots") this.dots(ctx, this.ys[i], X, Y, ratio);
-      if (series.kind === "bars") this.bars(ctx, series, i, X, Y);
       if (series.kind === "area" || (series.kind === "line" && this.halves[i])) {
         ctx.globalAlpha = opacity * (series.kind === "area" ? AREA : BAND);
         for (const edges of this.covers[i]) this.band(ctx, this.ys[i], edges, X, Y);
-      } else if (this.halves[i]) this.whiskers(ctx, series, i, X, Y, ratio);
+      }
     });
     ctx.restore();
   }
@@ -374,36 +359,6 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     ctx.fill();
   }
 
-  slot(series, X) { // width of a bar [px], and its offset from its x
-    const group = this.what.series.filter(({ kind }) => kind === "bars");
-    const step = this.x.length > 1 ? this.x[1] - this.x[0] : 1;
-    const width = 0.8 * (X(step) - X(0)) / (group.length || 1);
-    const place = group.indexOf(series);
-    return { width: 0.9 * width, shift: place < 0 ? 0 : width * (place - (group.length - 1) / 2) };
-  }
-
-  bars(ctx, series, i, X, Y) {
-    const { width, shift } = this.slot(series, X);
-    this.ys[i].forEach((v, k) => {
-      if (!Number.isFinite(v)) return;
-      ctx.fillRect(X(this.x[k]) + shift - width / 2, Y(0), width, Y(v) - Y(0));
-    });
-  }
-
-  whiskers(ctx, series, i, X, Y, ratio) {
-    const { shift } = this.slot(series, X);
-    if (series.kind === "bars") ctx.strokeStyle = tone("text");
-    ctx.lineWidth = 1.3 * ratio;
-    ctx.beginPath();
-    this.ys[i].forEach((v, k) => {
-      const half = this.halves[i][k];
-      if (!Number.isFinite(v + half)) return;
-      ctx.moveTo(X(this.x[k]) + shift, Y(v - half));
-      ctx.lineTo(X(this.x[k]) + shift, Y(v + half));
-    });
-    ctx.stroke();
-  }
-
   // ---- cursor and zoom ----
 
   move() { // the cursor to where the link shows it
@@ -431,8 +386,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
   }
 
   where(x) { // an x as text
-    const { x_names: names, logarithmic } = this.what;
-    if (names && names.length) return names[Math.round(x)];
+    const { logarithmic } = this.what;
     const [from, to] = this.window();
     return `${logarithmic.includes("x") ? words(x) : steady(x, to - from)} ${this.unit}`;
   }

@@ -5,7 +5,7 @@ const SLOW = 0.045; // [s] a frame
 const READINGS = onProcessor ? 250 : 100; // [ms] between two changes of the page about the view
 const COARSEST = 0.5; // share of the pixels' width that a slow processor draws at least
 const clock = { time: data.start, playing: !matchMedia("(prefers-reduced-motion: reduce)").matches,
-  speed: 1, loop: true, follow: Boolean(data.live), start: data.start, end: 0, frames: 0, at: 0 };
+  speed: 1, loop: true, start: data.start, end: 0, frames: 0, at: 0 };
 clock.end = Math.max(motion.end, ...ghostMotions.map(({ end }) => end));
 const slider = byId("time"), clockText = byId("clock"), playButton = byId("play");
 let shown = null, readings = null, announced = -Infinity;
@@ -49,7 +49,6 @@ function showReadings(time) {
 }
 
 function seek(time) {
-  clock.follow = false;
   clock.time = Math.min(Math.max(time, clock.start), clock.end);
   readings = null;
   buttons();
@@ -61,7 +60,7 @@ function play() {
   buttons();
 }
 function pause() {
-  clock.playing = clock.follow = false;
+  clock.playing = false;
   readings = null;
   sharpen();
   buttons();
@@ -69,7 +68,6 @@ function pause() {
 function toggle() { if (clock.playing) pause(); else play(); }
 function buttons() {
   playButton.textContent = clock.playing ? "Pause" : "Play";
-  byId("live").setAttribute("aria-pressed", clock.follow);
   wake();
 }
 
@@ -99,8 +97,7 @@ function tick(now) {
   clock.at = now;
   clock.frames++;
   if (clock.playing && viewer && onProcessor) spare(passed);
-  if (clock.follow) clock.time = clock.end;
-  else if (clock.playing && clock.end > clock.start) {
+  if (clock.playing && clock.end > clock.start) {
     clock.time += passed * clock.speed;
     if (clock.time > clock.end) {
       const span = clock.end - clock.start;
@@ -115,7 +112,7 @@ function tick(now) {
   }
   isAsked = false; // only now: what was changed above is drawn
   clearTimeout(next);
-  if (clock.playing || clock.follow) next = setTimeout(wake, EVERY);
+  if (clock.playing) next = setTimeout(wake, EVERY);
   else last = null;
 }
 
@@ -125,7 +122,7 @@ const hasAddress = location.protocol !== "about:"; // the frame of a notebook ha
 let isRestored = false;
 
 function keep() {
-  if (!isRestored || !hasAddress || data.live) return;
+  if (!isRestored || !hasAddress) return;
   const state = { t: clock.time.toFixed(3) };
   if (chosen) state.model = models[chosen];
   if (picked) state.joint = data.scene.nodes[picked].name;

@@ -5,8 +5,6 @@ playButton.onclick = toggle;
 slider.oninput = () => { pause(); seek(Number(slider.value)); };
 byId("speed").onchange = (event) => { clock.speed = Number(event.target.value); };
 byId("loop").onchange = (event) => { clock.loop = event.target.checked; };
-byId("live").onclick = () => { clock.follow = true; buttons(); };
-byId("live").hidden = !data.live;
 
 document.addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.altKey || event.metaKey) return;

@@ -2,7 +2,6 @@
 const data = JSON.parse(document.getElementById("data").textContent);
 const byId = (id) => document.getElementById(id);
 const COLOURS = ["#2f7ed8", "#e0671f", "#3a9d5d", "#a855c7", "#b58900", "#c2366b"];
-const LONGEST = 20000; // rows of each table in memory of a live page
 
 function element(tag, attributes = {}, ...children) {
   const made = document.createElement(tag);
@@ -45,15 +44,6 @@ class Table { // times of the log and rows of numbers; in the page times are fro
     const share = (time - this.t[k]) / (this.t[k + 1] - this.t[k]);
     return this.rows[k].map((x, i) => x + share * (next[i] - x));
   }
-  push(t, row) {
-    this.t.push(t);
-    this.rows.push(row);
-    if (this.t.length <= LONGEST) return;
-    const { rows } = this;
-    const half = (_, k) => k % 2 === 0 || Number.isNaN(rows[k][0]); // gaps stay
-    this.t = this.t.filter(half);
-    this.rows = this.rows.filter(half);
-  }
 }
 
 const motion = new Table(data.motion.t, data.motion.q);
@@ -73,7 +63,6 @@ const bandTable = bands ? new Table(bands.t, bands.values) : null; // values, th
 
 const style = getComputedStyle(document.documentElement);
 const tone = (name) => style.getPropertyValue(`--${name}`).trim();
-const POOR = 0.5; // share of the RMS torque at full red, if the noise is unknown
 const UNSURE = "#8a97a5"; // without prediction
 const RAMP = [[43, 131, 186], [255, 255, 191], [215, 25, 28]]; // at 0, a half and 1
 function residualColour(share) { // 0 to 1; grey for NaN
@@ -82,23 +71,9 @@ function residualColour(share) { // 0 to 1; grey for NaN
   return `rgb(${RAMP[k].map((c, i) => Math.round(c + (x - k) * (RAMP[k + 1][i] - c)))})`;
 }
 
-const scale = { of: new Array(count).fill(1), full: POOR, unit: "RMS torque",
-  ...(torques && torques.scale) };
+const scale = torques ? torques.scale : null;
 const largest = new Array(count).fill(0); // [N m or N] torque of a full arc
-function measureTorques() {
-  const squares = new Array(count).fill(0);
-  let rows = 0;
-  largest.fill(0);
-  for (const row of torqueTable.rows) {
-    if (!Number.isFinite(row[0])) continue;
-    rows++;
-    for (let j = 0; j < count; j++) {
-      largest[j] = Math.max(largest[j], Math.abs(row[j]));
-      squares[j] += row[j] ** 2;
-    }
-  }
-  if (torques.scale || !rows) return; // a live page updates it with the data
-  squares.forEach((sum, j) => { scale.of[j] = Math.sqrt(sum / rows) || 1; });
-}
+for (const row of torques ? torqueTable.rows : [])
+  for (let j = 0; j < count; j++) largest[j] = Math.max(largest[j], Math.abs(row[j]) || 0);
 const residualShare = (row, j) => // 1 is full red; NaN without a prediction
   predictions ? Math.abs(row[j] - predictedOf(row, j)) / scale.of[j] / scale.full : NaN;

@@ -1,7 +1,7 @@
 
 // ---- in the frame of a report: one clock ------------------------------------------------------
 
-const report = window.parent === window || data.live ? null : window.parent;
+const report = window.parent === window ? null : window.parent;
 let isHeard = false, told = null; // the report has answered; the time that it has set
 
 function tellReport(time) {

@@ -1,7 +1,6 @@
 
 // ---- charts: torques of each joint, parameters over time --------------------------------------
 
-const LASTS = 60; // [s] shown by a live page
 const timeLine = charts.link("time"); // the charts' cursor is the clock's
 const torqueCharts = [], bandCharts = [];
 timeLine.on((time, how) => {
@@ -16,8 +15,7 @@ function moveCursor(time) { // of the charts, except one under the pointer
 }
 
 function span() { // range of the charts without zoom
-  return [data.live ? Math.max(clock.start, clock.end - LASTS) : clock.start,
-    Math.max(clock.end, clock.start + 1e-3)];
+  return [clock.start, Math.max(clock.end, clock.start + 1e-3)];
 }
 
 function resting(j) { // segments in which a joint is not used, from the columns of the strip
@@ -90,17 +88,4 @@ function drawBands() {
   };
   choice.onchange = draw;
   draw();
-}
-
-function refreshCharts(every = false) { // of a live page, those in sight, or at its end every one
-  const wanted = (chart) => every || timeLine.seen.has(chart);
-  timeLine.whole = span();
-  torqueCharts.forEach(({ chart, below }, j) => {
-    if (!wanted(chart) && !wanted(below)) return;
-    const [ys, residual] = torqueRows(j);
-    chart.setData(torqueTable.t, ys);
-    if (below) below.setData(torqueTable.t, [residual]);
-  });
-  for (const { i, chart } of bandCharts)
-    if (wanted(chart)) chart.setData(bandTable.t, bandRows(i), bandHalves(i));
 }

@@ -4,13 +4,12 @@
 slider.min = clock.start;
 slider.max = clock.end;
 timeLine.whole = span();
-if (torques) { measureTorques(); drawTorques(); }
+if (torques) drawTorques();
 if (bands) drawBands();
 byId("side").hidden = false;
 drawSwitches();
 drawModels();
 data.marks.forEach(addMark);
-if (data.live) listen();
 restore();
 showMasses();
 chooseArcs();
