@@ -132,6 +132,18 @@ def test_a_floating_base_comes_first(tmp_path):
     assert model.row_units == ("N",) * 3 + ("N m",) * 5
 
 
+def test_another_gravity_turns_what_holds_the_robot(ur5, rng):
+    q, still = rng.uniform(-3, 3, (2, 6)), np.zeros((2, 6))
+    pi = ur5.standard_parameters()
+    along = [
+        joint_torque_regressor(ur5.with_gravity(g), q, still, still) @ pi for g in -9.81 * np.eye(3)
+    ]
+    np.testing.assert_allclose(along[2], joint_torque_regressor(ur5, q, still, still) @ pi)
+    mixed = ur5.with_gravity(np.array([1.0, -2.0, 3.0]))
+    wanted = np.array([1.0, -2.0, 3.0]) @ along / -9.81
+    np.testing.assert_allclose(joint_torque_regressor(mixed, q, still, still) @ pi, wanted)
+
+
 def test_changed_parameters_stay_out_of_the_original(ur5):
     before = ur5.standard_parameters()
     other = ur5.with_parameters(before * 1.5)

@@ -61,8 +61,8 @@ def test_each_contact_has_its_own_speed_whatever_is_before_it(robot, walk):
         assert f"the link {foot} moves at {speed:.2g} m/s (RMS) while it is in contact" in f.message
 
 
-@pytest.fixture(scope="module")
-def ball(robot):
+@pytest.fixture(scope="module", params=[0.7, 2.3])
+def ball(robot, request):
     """Return a log of a robot that rolls on one foot, a ball of 25 mm, and lifts it at times."""
     t = np.arange(0.0, 6.0, 0.01)
     angle = 0.3 * np.sin(2.0 * t)
@@ -72,7 +72,7 @@ def ball(robot):
     centre = data.oMf[robot.pin_model.getFrameId(FEET[0], pin.FrameType.BODY)].translation
     pose = []
     for x, lift in zip(angle, height, strict=True):
-        turned = pin.rpy.rpyToMatrix(0.0, x, 0.7) @ pin.rpy.rpyToMatrix(0.5 * x, 0.0, 0.0)
+        turned = pin.rpy.rpyToMatrix(0.0, x, request.param) @ pin.rpy.rpyToMatrix(0.5 * x, 0.0, 0.0)
         pose.append(pin.SE3ToXYZQUAT(pin.SE3(turned, -turned @ centre + [0, 0, lift])))
     log = Log(t, np.zeros((len(t), 12)), np.zeros((len(t), 12)), robot.joints,
               base=BaseMotion(np.array(pose)), contacts={FEET[0]: height == 0.0})  # fmt: skip
