@@ -42,7 +42,8 @@ _ATTEMPTS = (3, 2)
 # The pool's feeder thread may be the last owner of a semaphore. If the process ends between the
 # calls that remove and unregister it, the resource tracker warns of a leak.
 _FEEDER = "QueueFeederThread"
-_ANSWER = 30.0  # largest time to wait for this thread, or for a worker of a cluster [s]
+_PATIENCE = 5.0  # largest time to wait for this thread [s]
+_ANSWER = 30.0  # ... for a worker of a cluster [s]
 
 
 class Workload(Protocol):
@@ -82,6 +83,7 @@ class WorkPlan:
     _size: int = field(default=1, init=False, repr=False)  # number of worker processes
     _executor: Executor | None = field(default=None, init=False, repr=False)
     _client: "Client | None" = field(default=None, init=False, repr=False)
+    _older: set[threading.Thread] = field(default_factory=set, init=False, repr=False)
     _reuses: bool = field(default=False, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -155,9 +157,9 @@ class WorkPlan:
             client.close(timeout=5)
         elif executor is not None:
             executor.shutdown(wait=True, kill_workers=is_urgent)  # type: ignore[call-arg]
-            for thread in threading.enumerate():
+            for thread in {*threading.enumerate()} - self._older:
                 if thread.name == _FEEDER:
-                    thread.join(_ANSWER)
+                    thread.join(_PATIENCE)
 
     def run(
         self, work: Work, pieces: Iterable[tuple[int, Workload]], lost: Lost | None = None
@@ -237,7 +239,8 @@ class WorkPlan:
         level = _log.getEffectiveLevel()
         try:
             return self._started().submit(run_task, work, piece, level)
-        except BrokenExecutor:  # a worker ended while it waited for work
+        except BrokenExecutor:  # a worker ended; the feeder of its pool may not end
+            self._older = {*threading.enumerate()}
             self.close(is_urgent=True)
             return self._started().submit(run_task, work, piece, level)
 
@@ -251,6 +254,7 @@ class WorkPlan:
             return self._executor
         from loky import ProcessPoolExecutor
 
+        self._older = {*threading.enumerate()}
         self._executor = ProcessPoolExecutor(
             self._size,
             initializer=_start_worker,

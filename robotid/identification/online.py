@@ -335,7 +335,7 @@ class OnlineIdentifier:
         names: Names of the base parameters.
 
     Raises:
-        DataError: If the base floats or the model is static; from ``reading``, ``compared`` and
+        DataError: If the base floats or the model is static; from ``reading`` and
             ``estimate``, before the end of the warm-up.
         SettingsError: If the cut-off is not below half the rate.
     """
