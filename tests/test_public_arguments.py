@@ -231,8 +231,8 @@ def test_a_path_that_no_file_system_takes_is_refused(model, log, path):
     [
         ("x", [0, 0], [0, 0], "t = x s is not finite"),
         (0.0, None, [0, 0], "q is None, wanted an array"),
-        (0.0, [0, 0, 0], [0], r"q has shape \(3,\) and tau \(1,\), wanted \(2,\) each"),
-        (0.0, [0, 0], [0, 0, 0], r"q has shape \(2,\) and tau \(3,\), wanted \(2,\) each"),
+        (0.0, [0, 0, 0], [0], r"q, tau have shapes \(3,\), \(1,\), wanted \(2,\) each"),
+        (0.0, [0, 0], [0, 0, 0], r"q, tau have shapes \(2,\), \(3,\), wanted \(2,\) each"),
         (0.0, [0, 0], ["x", 0], "tau is not an array of real numbers"),
         (0.0, [0, 0], [np.nan, 0], "is not finite, so it was refused"),
     ],

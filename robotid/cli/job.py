@@ -592,7 +592,7 @@ _SHOWN = {
 
 
 def add_shown(parser: argparse.ArgumentParser, *names: str, **words: str) -> None:
-    """Add switches of what is shown, with words where they differ from the usual ones."""
+    """Add switches of what is shown, with other words than the standard ones."""
     for name in (*names, *words):
         parser.add_argument(f"--{name}", action="store_true", help=words.get(name, _SHOWN[name]))
 

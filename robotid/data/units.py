@@ -116,7 +116,7 @@ def check_reach(
 
 
 def turned(joints: Sequence[str], q: Array, turning: Collection[str]) -> tuple[str, ...]:
-    """Return what is assumed of joints without limits that turn farther than others: q (N, n)."""
+    """Return what is assumed of joints without limits that rotate farther than others: q (N, n)."""
     far = [name for name, x in zip(joints, q.T, strict=True)
            if name in turning and np.abs(x).max() > _FARTHEST]  # fmt: skip
     if not far:

@@ -488,7 +488,7 @@ def _format_of(path: Path) -> Format:
 
 
 def write_columns(table: Mapping[str, Array], path: Path) -> None:
-    """Write columns (N,) to a file, at once or not at all; they are read exactly as written."""
+    """Write columns (N,) to a file, all or none; they are read exactly as written."""
     write = _WRITTEN[check_suffix(path)]
     with written_whole(path) as temporary:
         write(table, temporary)
