@@ -44,6 +44,13 @@ def test_distances_are_those_of_the_boxes(slider):
     assert near.distance[base_ball, 0] == pytest.approx(0.4, abs=1e-6)
 
 
+def test_what_stands_beside_a_robot_may_meet_its_first_link_but_the_base_may_not(panda):
+    post = Box("post", (0.2, -0.1, 0.0), (0.3, 0.1, 0.5))
+    pairs = Clearance(panda, boxes=[post]).named
+    assert ("panda_link1", "post") in pairs
+    assert not {("panda_link0", "panda_link1"), ("panda_link0", "post")} & set(pairs)
+
+
 def test_spheres_and_boxes_are_never_farther_apart_than_what_is_in_them(panda):
     clearance, rng = Clearance(panda, floor=-0.05), np.random.default_rng(6)
     q = rng.uniform(-1.5, 1.5, (40, len(panda.joints)))

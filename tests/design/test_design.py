@@ -194,3 +194,12 @@ def test_costs_are_those_of_the_augmented_lagrangian_and_slopes_their_derivative
     edge = own.distance_without_cost(aim)
     assert own.of_distances(edge, aim)[1] == pytest.approx(np.zeros((3, 5)), abs=1e-12)
     assert (own.of_distances(edge - 1e-6, aim)[1] > 0).all()
+
+
+def test_multipliers_on_a_finer_grid_have_the_same_sum_and_lie_between_their_neighbours(rng):
+    limits, distances = rng.random((6, 5, 2)), rng.random((3, 5))
+    fine = Multipliers(8.0, limits, distances).finer(4)
+    assert fine.weight == 2.0
+    for coarse, dense in ((limits, fine.limits), (distances, fine.distances)):
+        np.testing.assert_allclose(4 * dense[:, ::4], coarse)
+        np.testing.assert_allclose(8 * dense[:, 2::4], coarse[:, 1:] + coarse[:, :-1])

@@ -115,7 +115,9 @@ def test_a_wrench_with_the_axes_of_its_link(quadruped, rng):
         Contact("a", threshold="x")
 
 
-def test_unknown_forces_have_no_effect_and_measured_ones_are_subtracted(quadruped, rng):
+def test_unknown_forces_have_no_effect_and_measured_ones_are_subtracted(
+    quadruped, rng, monkeypatch
+):
     q, v, a = random_motion(quadruped, rng, 7)
     flags = rng.random((7, 3)) < 0.7
     pi = quadruped.standard_parameters()
@@ -134,6 +136,9 @@ def test_unknown_forces_have_no_effect_and_measured_ones_are_subtracted(quadrupe
     (predicted,) = predict(quadruped, [pi], found)
     with pytest.raises(DataError, match="has contact flags of 4 contacts, wanted 3, one for each"):
         constrained(quadruped, replace(motion, contacts=touching), used)
+    monkeypatch.setattr("robotid.dynamics.torque.BLOCK", 3)
+    W = np.vstack([rows for rows, *_ in build_problem(quadruped, found).blocks()])
+    np.testing.assert_allclose((W @ pi).reshape(7, 18), predicted, atol=1e-9)
     rest = np.arange(7) != 4
     np.testing.assert_allclose(found.tau[rest], predicted[rest], atol=1e-10)
     assert np.abs(found.tau).max() > 1.0

@@ -158,6 +158,11 @@ def test_logs_are_given_one_or_several_of_every_kind(ur5, tmp_path, rng):
             np.testing.assert_array_equal(back.tau, log.tau)
     assert len(read_logs([log, frame_of(log), tmp_path / "run.csv"], ur5.joints)) == 3
     assert read_logs((), ur5.joints) == ()
+    bare = replace(log, tau=0 * log.tau, has_torque=False)
+    with pytest.raises(DataError, match="has no torque"):
+        read_logs(bare, ur5.joints)
+    (measured,) = read_logs(replace(bare, wrenches={"fz foot": log.t}), ur5.joints)  # is enough
+    assert not measured.has_torque
     cases = ((3, "int"), ([log, None], "NoneType"), ({"q": 1}, "dict"), (log.q, "ndarray"))
     for wrong, kind in cases:
         with pytest.raises(DataError, match=f"^a log is a {kind}, wanted a robotid.Log, the path"):

@@ -108,6 +108,16 @@ def test_a_velocity_in_another_unit_is_told_with_its_factor(factor):
     assert found_of(log, "velocity_scale", velocity="auto") == []
 
 
+@pytest.mark.parametrize(("level", "names"), [(1.0, ()), (2.0, ("b",))])
+def test_a_torque_is_noisy_from_three_tenths_of_its_standard_deviation_on(level, names):
+    rng = np.random.default_rng(2)  # the torque itself has 4.9 N m RMS
+    tau = 5 * np.sqrt(2) * np.cos(np.arange(N) / RATE) + level * rng.standard_normal(N)
+    noisy = found_of(log_of_two(tau=tau), "noisy_torque")
+    assert tuple(joint for finding in noisy for joint in finding.joints) == names
+    for finding in noisy:
+        assert finding.evidence["share"] == pytest.approx(level / np.hypot(5.0, level), rel=0.05)
+
+
 def test_the_noise_of_a_channel_is_its_standard_deviation():
     levels = {f.where: f.evidence for f in found_of(log_of_two(), "noise")}
     assert levels["run.csv: tau"]["a"] == pytest.approx(0.05, rel=0.05)
