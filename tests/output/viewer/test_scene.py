@@ -54,12 +54,16 @@ def test_shapes_are_placed_as_in_the_urdf_and_cylinders_along_its_z(tmp_path):
     (tmp_path / "shapes.urdf").write_text(
         '<robot name="s"><link name="base"/><link name="a">'
         f"{''.join(visual.format(shape) for shape in shapes)}</link>"
-        '<joint name="j" type="revolute"><parent link="base"/><child link="a"/>'
+        '<link name="carrier"/><joint name="f" type="fixed"><parent link="carrier"/>'
+        '<child link="a"/><origin xyz="0.3 0 0.1" rpy="0 0.7 0.2"/></joint>'
+        '<joint name="j" type="revolute"><parent link="base"/><child link="carrier"/>'
         '<axis xyz="0 0 1"/><limit effort="1" velocity="1"/></joint></robot>'
     )
     scene = robot_scene(RobotModel.from_urdf(tmp_path / "shapes.urdf"))
     parts = {part["shape"]: part for part in scene.content["parts"] if part["node"] == 1}
-    wanted = pin.SE3(pin.rpy.rpyToMatrix(0.4, -0.5, 0.6), np.array([0.1, 0.2, 0.3])).homogeneous
+    fixed = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.7, 0.2), np.array([0.3, 0.0, 0.1]))
+    visual = pin.SE3(pin.rpy.rpyToMatrix(0.4, -0.5, 0.6), np.array([0.1, 0.2, 0.3]))
+    wanted = (fixed * visual).homogeneous
     found = {name: np.array(part["matrix"]).reshape(4, 4).T for name, part in parts.items()}
     for name, size in (("box", [1, 2, 3]), ("sphere", [0.2]), ("cylinder", [0.1, 0.5])):
         assert parts[name]["size"] == size
