@@ -94,8 +94,6 @@ def measured_errors(
             len(segments), 1 / share, np.full(b, np.inf),
         )  # fmt: skip
         meat, weight_ratio = R.T @ R / share + more, max(weight_ratio, 1.0)
-        if bounded is not None:
-            return _redrawn(estimate, errors, bounded, factors, sigma, share**2 * meat)
         covariance = C + share**2 * C @ more @ C if not is_standard else C
     else:
         theta, bread = estimate.theta, share * C

@@ -240,8 +240,9 @@ def _best_start(initial: "_Initial") -> tuple["_Initial", Array]:
 
     Others are tried where the error of a joint is larger than that of a good fit and hardly smaller
     than that of its second-order model: other scales of the torques. Torque limits are tried for
-    every error that is larger. Each group of joints with one gain takes its best. A fit that cannot
-    be simulated is no candidate.
+    every error that is larger, and taken if the error is then clearly smaller: they also fit what
+    is no limit. Each group of joints with one gain takes its best. A fit that cannot be simulated
+    is no candidate.
     """
     if initial.vary is None or initial.plain is None:
         return _first_fit(initial)[:2]
@@ -255,8 +256,9 @@ def _best_start(initial: "_Initial") -> tuple["_Initial", Array]:
             failure = exception
             continue
         error = fits[-1][2]
+        enough = HARDLY if has_limit else 1.0 / BEATEN
         for members in (groups == group for group in set(initial.groups)):
-            if np.mean(error[members] / best[members]) < 1.0 / BEATEN:
+            if np.mean(error[members] / best[members]) < enough:
                 factor[members], limited[members], best[members] = scale, has_limit, error[members]
         may_limit = not has_limit and (scale, True) in initial.starts
         if not ((best > GOOD_POSITION) & (may_limit | (best > HARDLY * second_order))).any():
