@@ -24,7 +24,7 @@ DATASET = Path("meta") / "info.json"
 #: Bytes of a whole path, and characters of an attribute of a URDF, which may be a path.
 LONGEST_PATH = 4095
 #: Levels of tables and lists, and of nested elements of a URDF.
-DEEPEST = 100
+DEEPEST = 40
 #: Files of results, which name the other files that were written with them.
 _RECORDS = ("result.json", "track.json", "fleet.json")
 _PAGES = ("report.html", "replay.html")  # beside a result

@@ -232,7 +232,7 @@ def test_rounded_angles_are_those_that_round_a_multiple_of_15_degrees():
 
 def test_files_without_end_or_bottom_are_refused_at_once(tmp_path):
     nested = written(tmp_path, "</link>", "<a>" * 1000 + "</a>" * 1000 + "</link>")
-    with pytest.raises(ModelError, match="elements are nested 101 levels deep, wanted at most 100"):
+    with pytest.raises(ModelError, match="elements are nested 41 levels deep, wanted at most 40"):
         read_tree(nested)
     long = written(tmp_path, 'name="arm"', f'name="{"x" * 10_000_000}"')
     with pytest.raises(ModelError, match=r"<link>: name has 10000000 characters.*'xxx") as caught:
