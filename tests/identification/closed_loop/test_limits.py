@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ from helpers.mujoco_plant import loaded, multisine, plant, rolled_out
 from robotid.data.log import Log
 from robotid.diagnosis.logs.command_channels import largest_speeds
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
+from robotid.identification.closed_loop import stages
 from robotid.identification.closed_loop.from_commands import identify_loops
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 
@@ -95,3 +97,27 @@ def test_a_drive_that_saturates_while_it_follows_has_its_limit_and_gain_found():
     assert (said.where, said.severity) == (hip, "warning")
     assert "saturates" in said.message
     assert not any(name.endswith("calf_joint.limit") for name in values), "its drive stays below"
+
+
+@pytest.mark.parametrize(
+    ("limited", "taken"), [((5.0, 2.9), (False, False)), ((3.0, 2.9), (True, False))]
+)
+def test_a_limit_that_was_not_asked_for_is_taken_where_the_error_is_clearly_smaller(
+    limited, taken, monkeypatch
+):
+    errors = {(False, False): (6.0, 3.0), (True, True): limited, (True, False): limited}
+
+    def first_fit(initial):
+        return initial, None, np.array(errors[*map(bool, initial.limited)])
+
+    def vary(factor, limited):
+        return SimpleNamespace(factor=factor, limited=limited)
+
+    monkeypatch.setattr(stages, "_first_fit", first_fit)
+    monkeypatch.setattr(stages, "_errors_of", lambda *_: np.array([50.0, 50.0]))
+    initial = SimpleNamespace(
+        torque=np.ones(2), groups=("hip", "knee"), starts=((1.0, False), (1.0, True)), vary=vary,
+        plain=SimpleNamespace(loops=None), simulator=None,
+    )  # fmt: skip
+    chosen, _ = stages._best_start(initial)
+    np.testing.assert_array_equal(chosen.limited, taken)

@@ -43,6 +43,7 @@ def test_errors_are_those_of_the_logs_in_mrad_and_mm(found, page):
         assert rows[joint]["samples"] == str(len(run.log.t))
     mean = np.sqrt(error[0] * error[1])
     assert f"<strong>{mean:.3g} mm or mrad</strong>, geometric mean of 2 joints" in page
+    assert "fitted samples, without validation log" not in page
     assert [*bars(page)] == sorted(JOINTS, key=lambda joint: -float(rows[joint]["error %"]))
 
 
@@ -94,6 +95,7 @@ def test_without_validation_the_fitted_logs_are_shown_and_a_torque_is_no_command
     ]
     page = page_of(replace(found, fitted=tuple(driven), validation=()), tmp_path)
     assert "There is no validation log" in page
+    assert "fitted samples, without validation log" in page
     drawn = next(c for c in charts(page) if c["title"] == "position of rail")
     labels = [line["label"] for line in drawn["series"]]
     assert labels == ["measured", "simulated"]
