@@ -12,6 +12,7 @@ import tomllib
 import warnings
 import zipfile
 from functools import cache, partial
+from itertools import pairwise
 from pathlib import Path
 
 import h5py
@@ -358,36 +359,53 @@ def broken(draw, text, others):
     return text[:at] + draw(st.sampled_from(others)) + text[at:]
 
 
-def _paths(table, prefix=()):
-    """Yield the path of every key of a schema."""
-    for key, kind in table.items():
-        yield (*prefix, key)
-        inner = kind[0] if isinstance(kind, list) else kind
-        if isinstance(inner, dict):
-            yield from _paths(inner, (*prefix, key))
+rarely = st.integers(0, 9).map(lambda n: n == 0)
+#: What the settings of a kind may be, to their ends.
+MILD_OF = {
+    bool: st.booleans(),
+    str: any_of("usual none pd feedforward computed_torque perfect joint motor torque find urdf "
+                "one group link_1 link_2"),
+    float: st.sampled_from([0, 1e-9, 1e-3, 0.05, 0.5, 1, 1.0, 5.0, 30.0, 1e3, 1e5, 1e9, 1e12]),
+    list: st.sampled_from([[0.0, 0.0, 0.1], [1.0, 0.0, 1.0, 0.0, 0.0, 1.0], [1e9] * 6, [JOINTS]]),
+}  # fmt: skip
+named = st.sampled_from([*JOINTS, *JOINTS, "x", "joint_1.viscous", "link_1.mass"])
+MILD_OF[dict] = st.dictionaries(named, MILD_OF[float] | plain, max_size=3)
 
 
-PATHS = sorted(_paths(Job.schema()))
+def keys_of(schema, prefix=()):
+    """Yield the path and the kinds of every key of a schema, those of tables, too."""
+    for key, kind in schema.items():
+        path = (*prefix, key, 0) if isinstance(kind, list) else (*prefix, key)
+        table = kind[0] if isinstance(kind, list) else kind
+        if isinstance(table, dict):
+            yield from keys_of(table, path)
+        kinds = (dict,) if isinstance(table, dict) else kind
+        yield path, (kinds.outer,) if hasattr(kinds, "outer") else kinds
+
+
+@st.composite
+def settings_of(draw, schema, start="", odd=1):
+    """A table of a schema, begun as TOML, with more values, ``odd`` of ten of the wrong kind."""
+    table = tomllib.loads(start)
+    for path, kinds in draw(st.lists(st.sampled_from(list(keys_of(schema))), max_size=3)):
+        mild = st.one_of(*(MILD_OF[float if one is int else one] for one in kinds))
+        inside, value = table, draw(values if draw(st.integers(0, 9)) < odd else mild)
+        with contextlib.suppress(
+            TypeError, IndexError, AttributeError
+        ):  # an earlier value took that place
+            for key, following in pairwise(path):
+                default = [{}] if following == 0 else {}
+                inside = inside[key] if key == 0 else inside.setdefault(key, default)
+            inside[path[-1]] = value
+    return table
 
 
 @st.composite
 def jobs(draw):
     """The text of a job file with some values of any type and size."""
-    table = tomllib.loads(JOB)
+    table = draw(settings_of(Job.schema(), JOB, odd=7))
     if draw(st.booleans()):
         table["estimator"] = {"name": draw(st.sampled_from(sorted(ESTIMATORS)))}
-    for _ in range(draw(st.integers(1, 3))):
-        *above, last = draw(st.sampled_from(PATHS))
-        inside = table
-        for key in above:
-            inside = inside.setdefault(key, {}) if isinstance(inside, dict) else inside[0]
-            if not isinstance(inside, dict | list) or inside == []:
-                break
-        else:
-            if isinstance(inside, list):
-                inside = inside[0]
-            if isinstance(inside, dict):
-                inside[last] = draw(values)
     return broken(draw, toml_file(table), ["[" * 3000, "=", '"', "\0", "1" * 5000])
 
 
@@ -409,11 +427,15 @@ def toml(value):
     return repr(value)
 
 
-def run_job_file(text, folder):
-    write_log(good_log(200), folder / "fit.csv")
+def run_job(text, log, folder):
+    write_log(log, folder / "fit.csv")
     path, out = folder / "job.toml", folder / "out"
-    path.write_text(text, encoding="utf-8")
+    path.write_text(text, encoding="utf-8", errors="replace")
     obey("identify", path, "--out", out, out=out)
+
+
+def run_job_file(text, folder):
+    run_job(text, good_log(200), folder)
 
 
 flags = any_of(
@@ -496,14 +518,18 @@ def edited(content, given):
     return content
 
 
+def edits(places, new=replacements, least=0, most=2):
+    """Return a strategy of what is done with values at some of the places of a JSON value."""
+    actions = st.sampled_from(["put", "put", "drop", "add"])
+    place = st.sampled_from(places) if isinstance(places, list) else places
+    return st.lists(st.tuples(place, actions, new), min_size=least, max_size=most)
+
+
 @st.composite
 def results(draw):
     """The text of a result.json with values of any shape."""
-    actions, places = st.sampled_from(["put", "put", "drop", "add"]), result_places()
-    given = [
-        (draw(st.sampled_from(draw(st.sampled_from(places)))), draw(actions), draw(replacements))
-        for _ in range(draw(st.integers(1, 3)))
-    ]
+    deep = st.one_of(*(st.sampled_from(some) for some in result_places()))
+    given = draw(edits(deep, least=1, most=3))
     text = json.dumps(edited(json.loads(good_result()[1]), given))
     return broken(draw, text, ["[" * 5000, "", "\0", "9" * 5000, "é"])
 
