@@ -300,9 +300,9 @@ def run_drive_job(table, folder, samples=200):
 
 #: By name: a strategy of examples, and what is done with one in an empty folder.
 COMMAND_KINDS = {
-    "excite": (lambda: excitements, (), run_excite),
-    "simulate": (lambda: simulations, (), run_simulate),
-    "LeRobot dataset": (datasets, (), run_dataset),
-    "drives of a job": (drive_jobs, (), run_drive_job),
-    "loop of a job": (loop_jobs, (), partial(run_drive_job, samples=80)),
+    "excite": (excitements, run_excite),
+    "simulate": (simulations, run_simulate),
+    "LeRobot dataset": (datasets(), run_dataset),
+    "drives of a job": (drive_jobs(), run_drive_job),
+    "loop of a job": (loop_jobs(), partial(run_drive_job, samples=80)),
 }

@@ -46,7 +46,7 @@ def obey(*words, out=None):
 
     ``out`` is the file, or the folder, that it writes to.
     """
-    before = None if out is None else files_in(out)
+    before = files_in(out)
     shown, error = io.StringIO(), io.StringIO()
     with (
         contextlib.redirect_stdout(shown),
@@ -61,17 +61,16 @@ def obey(*words, out=None):
     assert code in (0, 1, 2), f"exit code {code}"
     assert "Traceback" not in error.getvalue()
     assert len(error.getvalue()) < 20_000, "an error of pages"
-    if out is not None and code != 0:
+    if code != 0:
         assert files_in(out) == before, f"half-written: {files_in(out)}"
-    if out is not None:
-        hidden = [name for name in files_in(Path(out).parent) if "/." in name]
-        assert not hidden, f"left behind: {hidden}"
+    hidden = [name for name in files_in(out and Path(out).parent) if "/." in name]
+    assert not hidden, f"left behind: {hidden}"
     return code
 
 
 def files_in(place):
-    place = Path(place)
-    found = place.rglob("*") if place.is_dir() else [place] if place.exists() else []
+    place = Path(place or "nowhere")
+    found = place.rglob("*") if place.is_dir() else [place]
     return sorted(str(path) for path in found if path.is_file())
 
 
@@ -118,24 +117,19 @@ def good_file(name):
     log = good_log()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
-        table = {"time": log.t, "q": log.q, "tau": log.tau, "joints": np.array(JOINTS)}
-        match name:
-            case "log.mcap":
-                write_mcap(path, messages_of(log))
-            case "log.bag":
-                write_bag1(path, messages_of(log))
-            case "log.db3":
-                write_bag2(path.with_suffix(""), {"/joint_states": messages_of(log)})
-                path = next(path.with_suffix("").glob("*.db3"))
-            case "plain.mat":
-                scipy.io.savemat(path, table)
-            case "plain.npz":
-                np.savez(path, **table)
-            case "plain.h5":
-                table["joints"] = [joint.encode() for joint in JOINTS]
-                write_hdf5(table, path)
-            case _:
-                write_log(log, path)
+        joints = [joint.encode() for joint in JOINTS]
+        table = {"time": log.t, "q": log.q, "tau": log.tau, "joints": joints}
+        if name == "log.mcap":
+            write_mcap(path, messages_of(log))
+        elif name == "log.bag":
+            write_bag1(path, messages_of(log))
+        elif name == "log.db3":
+            write_bag2(path.with_suffix(""), {"/joint_states": messages_of(log)})
+            path = next(path.with_suffix("").glob("*.db3"))
+        elif name.startswith("plain"):
+            READERS[path.suffix](table, path)
+        else:
+            write_log(log, path)
         return path.read_bytes()
 
 
@@ -167,10 +161,6 @@ def spoilt(draw, name):
             case "repeat":
                 content[at:at] = content[at : at + length]
     return bytes(content)
-
-
-def write_bytes(content, path):
-    path.write_bytes(content)
 
 
 # --- tables of hostile values --------------------------------------------------------------------
@@ -230,23 +220,19 @@ def write_csv(table, path):
     path.write_text("\n".join([",".join(table), *rows]), encoding="utf-8")
 
 
-def write_npz(table, path):
-    np.savez(path, **table)
-
-
-def write_mat(table, path):
-    scipy.io.savemat(path, table)
-
-
 def write_hdf5(table, path):
     with h5py.File(path, "w") as file:
         for name, values in table.items():
             file.create_dataset(name, data=values)
 
 
-def write_parquet(table, path):
-    pyarrow.parquet.write_table(pyarrow.table(table), path)
-
+READERS = {
+    ".csv": write_csv,
+    ".npz": lambda table, path: np.savez(path, **table),
+    ".mat": lambda table, path: scipy.io.savemat(path, table),
+    ".h5": write_hdf5,
+    ".parquet": lambda table, path: pyarrow.parquet.write_table(pyarrow.table(table), path),
+}
 
 # --- containers that claim what they do not hold -------------------------------------------------
 
@@ -270,9 +256,8 @@ def headers(draw):
     """Members of a zip whose NumPy headers claim anything."""
     made = {}
     for name in draw(st.lists(keys, min_size=1, max_size=4, unique=True)):
-        shape = tuple(draw(shapes))
         kind = draw(any_of("<f8 |O <U9 >i2 <M8[s] nonsense <f16 |V0"))
-        lacking = {"descr": kind, "shape": shape}
+        lacking = {"descr": kind, "shape": tuple(draw(shapes))}
         whole = lacking | {"fortran_order": draw(st.booleans())}
         texts = [repr(whole), repr(lacking), "{" * 200, "__import__('os')", ""]
         text = draw(st.sampled_from(texts))
@@ -310,16 +295,9 @@ links = st.dictionaries(link_names, st.sampled_from(targets), max_size=3)
 odd_hdf5 = st.tuples(arrays, st.dictionaries(keys, shapes, max_size=3), links)
 
 
-def cell_array(items):
-    """Return what SciPy writes as a cell array."""
-    made = np.empty(len(items), dtype=object)
-    for k, item in enumerate(items):
-        made[k] = item
-    return made
-
-
 def _nested(inner):
-    return st.lists(inner, max_size=3).map(cell_array) | st.dictionaries(keys, inner, max_size=3)
+    cell_arrays = st.lists(inner, max_size=3).map(lambda items: np.fromiter(items, dtype=object))
+    return cell_arrays | st.dictionaries(keys, inner, max_size=3)
 
 
 cells = st.recursive(odd, _nested)
@@ -551,32 +529,32 @@ def run_result(text, folder):
 
 # --- all of them ---------------------------------------------------------------------------------
 
-READERS = {".csv": write_csv, ".npz": write_npz, ".mat": write_mat, ".h5": write_hdf5,
-           ".parquet": write_parquet}  # fmt: skip
 FILES = [*(f"log{x}" for x in (*READERS, ".mcap", ".bag", ".db3")),
          "plain.npz", "plain.mat", "plain.h5"]  # fmt: skip
 
 
-def logs_of(write, suffix):
-    return (), partial(read_log_file, write, suffix)
+def read_as(suffix, write=None):
+    return partial(read_log_file, write or READERS[suffix], suffix)
 
 
 #: By name: a strategy of examples, and what is done with one in an empty folder.
 KINDS = {
     **{
-        f"bytes of {name}": (spoilt, (name,), logs_of(write_bytes, Path(name).suffix)[1])
+        f"bytes of {name}": (
+            spoilt(name), read_as(Path(name).suffix, lambda new, path: path.write_bytes(new))
+        )
         for name in FILES
     },
-    **{f"values in {suffix}": (columns, *logs_of(x, suffix)) for suffix, x in READERS.items()},
-    "headers in .npz": (headers, *logs_of(write_members, ".npz")),
-    "arrays in .npz": (lambda: arrays, *logs_of(write_npz, ".npz")),
-    "structure of .h5": (lambda: odd_hdf5, *logs_of(write_odd_hdf5, ".h5")),
+    **{f"values in {suffix}": (columns(), read_as(suffix)) for suffix in READERS},
+    "headers in .npz": (headers(), read_as(".npz", write_members)),
+    "arrays in .npz": (arrays, read_as(".npz")),
+    "structure of .h5": (odd_hdf5, read_as(".h5", write_odd_hdf5)),
     "structure of .mat": (
-        lambda: st.dictionaries(keys, cells, max_size=4), *logs_of(write_odd_mat, ".mat")
+        st.dictionaries(keys, cells, max_size=4), read_as(".mat", write_odd_mat)
     ),
-    "values, identified": (columns, (300, st.sampled_from(MILD)), identify_from),
-    "job file": (jobs, (), run_job_file),
-    "flags": (lambda: command_lines, (), run_flags),
-    "result.json": (results, (), run_result),
-    "URDF": (urdf_inputs, (), run_urdf),
+    "values, identified": (columns(300, st.sampled_from(MILD)), identify_from),
+    "job file": (jobs(), run_job_file),
+    "flags": (command_lines, run_flags),
+    "result.json": (results(), run_result),
+    "URDF": (urdf_inputs(), run_urdf),
 }  # fmt: skip
