@@ -67,7 +67,12 @@ def fit_findings(
     if fit.outliers:
         yield _of_outliers(fit)
     yield from (misfit_finding(misfit, fit, on_misfit) for misfit in misfits)
-    yield from (*_drive_findings(fit), *_correlated(fit), *discrepancies, *encoder_noise(fit))
+    yield from (
+        *_drive_findings(fit),
+        *correlated_findings(fit),
+        *discrepancies,
+        *encoder_noise(fit),
+    )
     for e in fit.refitted:
         yield finding("validation_was_fitted", subject=e.recording.log.path, name=e.recording.name)
     yield from _costs(fit)
@@ -141,7 +146,7 @@ def _drive_findings(fit: Fit) -> Iterator[Finding]:
                     )  # fmt: skip
 
 
-def _correlated(fit: Fit) -> Iterator[Finding]:
+def correlated_findings(fit: Fit) -> Iterator[Finding]:
     """Yield notes on drives with parameters of which only the sum is determined.
 
     They have a strongly correlated pair, or terms that increase another standard error tenfold.

@@ -12,6 +12,7 @@ from robotid.diagnosis.verdict.parameter_table import (
     correlated_parameters,
     correlated_sets,
 )
+from robotid.diagnosis.verdict.fit_findings import correlated_findings
 from robotid.output.files.entries import build_result
 from robotid.output.files.result_file import Result
 
@@ -91,6 +92,12 @@ def test_a_parameter_is_correlated_with_another_one_of_its_own_drive_that_has_an
     pairs = correlated_parameters(found)
     assert {i: k for i, (k, _) in pairs.items()} == {i: k for i, (k, _) in wanted.items()}
     assert [r for _, r in pairs.values()] == pytest.approx([r for _, r in wanted.values()])
+    names = [f"{'xab'[(i + 2) // 4]}.{i}" for i in range(10)]
+    layout.names, layout.prismatic, found.drives = names, (), ()
+    found.standard = found.standard_error = np.ones(10)
+    line = np.linspace(0.0, 1.0, 3)
+    found.friction = lambda joint: SimpleNamespace(v=line, torque=line, std=line)
+    assert [f.evidence["r"] for f in correlated_findings(found)] == pytest.approx([-0.97, 0.951])
 
 
 def test_sets_are_joined_by_correlations_of_either_sign_and_hold_numbers_of_all_parameters():
