@@ -26,19 +26,8 @@ import numpy as np
 
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
-from robotid.diagnosis.decisions import (
-    FAMILY_P_VALUE,
-    FEWEST,
-    NOTHING,
-    OUTLIER,
-    SEGMENTS,
-    SHORTEST,
-    Option,
-    Round,
-    Rule,
-    p_value,
-    select,
-)
+from robotid.diagnosis import decisions
+from robotid.diagnosis.decisions import Option, Round, Rule, p_value, select
 from robotid.diagnosis.logs.channels import distance
 from robotid.dynamics.constraint_rows import without_forces
 from robotid.dynamics.prepared_logs import independent_share
@@ -99,10 +88,9 @@ class Normal:
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Samples of the recordings, weighted for each joint by its RMS residual, 0 where not used.
+    """Samples of the recordings, weighted for each joint by its RMS residual, 0 where not used."""
 
-    Rows of a floating base precede those of the n joints.
-    """
+    # Rows of a floating base precede those of the n joints.
 
     joints: tuple[str, ...]
     is_prismatic: Array  # (n,), bool
@@ -198,7 +186,7 @@ def take_sample(fit: Solution, *, for_drives: bool = False, is_free: bool = Fals
     own = sum(map(len, rows[: len(fit.fitted)]))
     segments = _segments(own, sum(map(len, rows)) - own, independent)
     number = sum(part.stop <= own for part in segments)
-    if number < FEWEST:
+    if number < decisions.FEWEST:
         return None
     motion = [e.recording.trajectory.at(k) for e, k in parts]
     Y = np.concatenate([_regressor(model, e.recording.trajectory, k) for e, k in parts])
@@ -232,10 +220,8 @@ def take_sample(fit: Solution, *, for_drives: bool = False, is_free: bool = Fals
 
 
 def _free(sample: Sample, X: Array) -> Sample:
-    """Return the samples with the bodies of least squares, if these predict held-out segments.
-
-    A prior that is wrong binds the bodies, and its error looks like friction.
-    """
+    """Return the samples with the bodies of least squares, if these predict held-out segments."""
+    # A prior that is wrong binds the bodies, and its error looks like friction.
     W = sample.weight[..., None] * X
     size = np.linalg.norm(W[: sample.rows], axis=(0, 1))
     spread = _FREE * np.linalg.norm(sample.r) / np.where(size > 0, size, np.inf)
@@ -244,7 +230,7 @@ def _free(sample: Sample, X: Array) -> Sample:
     free = replace(sample, W=W, U=np.diag(spread), normal=normal)
     none = np.empty((*sample.r.shape, 0))
     before, after = (Trials(x, none).held_out.left([]) for x in (sample, free))
-    if p_value(before, after, sample.fitted) >= FAMILY_P_VALUE:
+    if p_value(before, after, sample.fitted) >= decisions.FAMILY_P_VALUE:
         return sample
     change = normal.whole[1] @ normal.B[: sample.fitted].sum(axis=0)
     standard = sample.standard.copy()
@@ -292,7 +278,11 @@ def _segments(fitted: int, validation: int, independent: float) -> tuple[slice, 
     """Return the segments of the samples of fitted and of validation recordings."""
     edges = [0]
     for rows in (fitted, validation):
-        count = min(SEGMENTS, max(1, int(rows * independent / SHORTEST))) if rows else 0
+        count = (
+            min(decisions.SEGMENTS, max(1, int(rows * independent / decisions.SHORTEST)))
+            if rows
+            else 0
+        )
         first = edges[-1]
         edges += [first + rows * (i + 1) // count for i in range(count)]
     return tuple(slice(*pair) for pair in pairwise(edges))
@@ -318,15 +308,13 @@ def _lengths(basis: Array) -> Array:
 
 
 def _noise_level(r: Array, used: Array, own: int, basis: Array | None) -> tuple[Array, Array]:
-    """Return the used rows without outliers, and the RMS residual of each row, (n_rows,).
-
-    Rows that were projected together have one noise level, and an outlier excludes its sample.
-    """
+    """Return the used rows without outliers, and the RMS residual of each row, (n_rows,)."""
+    # Rows that were projected together have one noise level, and an outlier excludes its sample.
     u = np.ones(r.shape) if basis is None else _lengths(basis)
     size = np.abs(r) / u
     columns = zip(size[:own].T, used[:own].T, strict=True)
     typical = np.array([np.median(x[at]) if at.any() else np.inf for x, at in columns])
-    usual: Array = size <= OUTLIER * typical
+    usual: Array = size <= decisions.OUTLIER * typical
     if basis is not None:
         usual = np.all(usual | ~used, axis=1, keepdims=True)
     used = used & usual
@@ -338,10 +326,8 @@ def _noise_level(r: Array, used: Array, own: int, basis: Array | None) -> tuple[
 
 
 def _is_steady(recording: Recording) -> Array:
-    """Return the samples that are far from reversals and rest of each joint, shape (N, n), bool.
-
-    Near these the filter smears stiction, which then does not look like friction.
-    """
+    """Return the samples that are far from reversals and rest of each joint, shape (N, n), bool."""
+    # Near these the filter smears stiction, which then does not look like friction.
     motion, signals = recording.trajectory, recording.signals
     if signals.cutoff is None:
         return np.ones(motion.v.shape, dtype=bool)
@@ -373,11 +359,9 @@ class Trial:
         return np.asarray(np.linalg.solve(products, S[..., k, -1][..., None])[..., 0])
 
     def estimate(self, which: Sequence[int], fitted: int) -> tuple[Array, Array]:
-        """Return the parameters of some columns and their covariance, shapes (k,) and (k, k).
-
-        Of a fit to all samples. The covariance is that of clusters: from the scatter of the scores
-        between segments, valid for noise of any colour.
-        """
+        """Return the parameters of some columns and their covariance, shapes (k,) and (k, k)."""
+        # Of a fit to all samples. The covariance is that of clusters: from the scatter of the
+        # scores between segments, valid for noise of any colour.
         theta, S = self.parameters(which), self.S[which][:, which]
         H = self.H[:fitted, which]
         scores = H[:, :, -1] - H[:, :, which] @ theta  # (K, k)
@@ -464,10 +448,8 @@ class Trials:
         tried: Callable[[Option], int] = lambda option: 1,
         excludes: Callable[[Option, Option], bool] = operator.eq,
     ) -> Iterator[Accepted[Option]]:
-        """Yield the options that explain the residual, one after the other, by their columns.
-
-        An option that was selected excludes others: itself, unless stated otherwise.
-        """
+        """Yield the options that explain the residual, one after the other, by their columns."""
+        # An option that was selected excludes others: itself, unless stated otherwise.
         held_out, fitted, columns = self.held_out, self.sample.fitted, list[int]()
         alone = before = held_out.left([])
         of_fitted, of_validation = (float(x.sum()) for x in np.split(alone, [fitted]))
@@ -484,7 +466,7 @@ class Trials:
             new, confirmed = slice(-len(offered[best]), None), None
             if len(alone) > fitted:
                 gain = float((before - trial.left[best])[fitted:].sum())
-                confirmed = gain / max(of_validation, NOTHING)
+                confirmed = gain / max(of_validation, decisions.NOTHING)
             others = [x for x in trial.alike(rule, tried) if x != best]
             share, chance = trial.share(best), trial.p_value(best)
             parameters = columns.copy(), theta[new], covariance[new, new]
