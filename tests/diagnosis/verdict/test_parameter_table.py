@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from robotid.diagnosis.verdict import parameter_table
+from robotid.diagnosis.verdict.fit_findings import correlated_findings
 from robotid.diagnosis.verdict.parameter_table import (
     central_parameters,
     correlated_parameters,
     correlated_sets,
 )
-from robotid.diagnosis.verdict.fit_findings import correlated_findings
 from robotid.output.files.entries import build_result
 from robotid.output.files.result_file import Result
 
