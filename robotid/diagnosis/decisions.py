@@ -98,7 +98,6 @@ NO_ERROR_OF_MASSES = 3.0
 SCATTERED = 3
 #: A sum of squares that is 0, as a divisor.
 NOTHING = 1e-300
-_STILL = 1e-9  # of the largest squared residual of a segment: below, the joint is at rest in it
 Option = TypeVar("Option", bound=Hashable)
 
 
@@ -172,7 +171,7 @@ def p_value(before: Array, after: Array, fitted: int) -> float:
 
 def _student(before: Array, after: Array) -> float:
     """Return the p-value of the mean share; 1 for too few segments."""
-    moves = before > _STILL * before.max(initial=0.0)
+    moves = before > ROUNDING * before.max(initial=0.0)  # else the joint is at rest in the segment
     if moves.sum() < SCATTERED:
         return 1.0
     gain = (before - after)[moves] / np.maximum(before, after)[moves]

@@ -29,15 +29,17 @@ from robotid.robot.model import RobotModel
 
 _MOST = 1000  # samples at which poses and forces are compared
 _MOVES = 5e-3  # [m/s] speed of feet on the ground below which they are at rest
-_SLIDES = 0.1  # [m/s] RMS speed of a foot in contact that is reported ...
-_STANDS = 0.3  # ... if it is above this share of its speed without contact, or without rolling
+# [m/s] RMS speed of a foot in contact that is reported above this share of its speed without
+# contact, or without rolling.
+_SLIDES, _STANDS = 0.1, 0.3
 _LOADED = 0.1  # of the largest measured force: a foot with more is on the ground
 _ALIKE = (0.6, 1.6)  # factors of the forces that a wrong URDF explains
 _FORCE_UNITS = {"kN": 1e3, "kgf": 9.81}
-_SLOWER = 0.65  # ratio of the speeds below which another pose is found ...
-_BETTER = 0.5  # ... and of residuals, below which other forces or another twist are
-_SIMPLER = 1.2  # a pose with another change is preferred if it reduces the speed by this ...
-_NOISE = 1e-3  # [m/s or rad/s] ... plus this; RMS from which velocities are compared
+_SLOWER, _BETTER = 0.65, 0.5  # ratio of speeds below which another pose, of residuals another
+# twist or other forces explain the motion
+# A pose with another change must reduce the speed by this factor, plus this noise [m/s or rad/s],
+# the RMS value from which velocities are compared.
+_SIMPLER, _NOISE = 1.2, 1e-3
 # of the motion or weight: difference of a wrong velocity or force, of a velocity with a cause
 _UNLIKE, _SOME = 0.3, 0.05
 _DEGREES = np.pi / 180
@@ -45,11 +47,11 @@ _UNITS = {"linear": ("mm/s", 1e-3), "angular": ("deg/s", _DEGREES)}
 _BACK = np.array([-1.0, -1.0, -1.0, 1.0])  # signs of the inverse quaternion
 _ABOVE = 0.3  # vertical distance of base and feet over their distance, from which one is above
 _ALONG = 0.8  # component of the unit vector from the feet to the base that may be the vertical
-_STRIDE = 0.2  # [s] over which the acceleration of a base is averaged against noise
-_FASTEST = 30.0  # [m/s^2] RMS of this above which its position is in mm
+# [s] over which the acceleration of a base is averaged; [m/s^2] RMS of it above which it is in mm
+_STRIDE, _FASTEST = 0.2, 30.0
 _IMU_MOVES = 0.1  # [rad/s] RMS from which angular velocities are compared
-_TILT = 8.0  # [deg] largest angle between the mean specific force and the vertical
-_SHORTEST = 2.0  # [s] in which the mean acceleration of a robot is small
+# [deg] largest angle of the mean specific force from the vertical; [s] its mean is then gravity
+_TILT, _SHORTEST = 8.0, 2.0
 
 
 def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator[Finding]:

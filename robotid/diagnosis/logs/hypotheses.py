@@ -36,8 +36,8 @@ _SLOW = 0.05  # largest speed of the unknown sign of friction of a slow joint, o
 _POOR = 0.08  # unexplained share from which other readings of the positions are tested
 _ROWS, _QUARTER = 200, 4  # rows of these tests, and the divisor of their number in a first pass
 _OFFSETS = (0.4, -0.4, np.pi / 2, -np.pi / 2, np.pi)  # [rad] errors of a zero position
-_ITERATIONS = 8  # of signs and fit
-_FOLDED = 0.4  # largest ratio of unexplained shares at which a torque is an absolute value
+# Iterations of signs and fit; ratio of unexplained shares up to which a torque is an absolute value
+_ITERATIONS, _FOLDED = 8, 0.4
 
 
 @dataclass(frozen=True, eq=False)

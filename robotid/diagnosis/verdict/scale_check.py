@@ -26,8 +26,9 @@ _POSES = 300  # at which gravity is compared
 _LOADED = 0.02  # share of the largest gravity torque above which a joint is compared
 _HELD_BACK = 1.5  # residual over that of WLS beyond which the prior determines the result
 _ANOTHER = 0.35  # difference of gravity and total mass from which on they contradict the scale
-_CLEARLY = 4.0  # distance of a common factor from 1 over the share of gravity that it leaves, ...
-_BETTER = 0.5  # ... and the largest ratio of that share to the one that a payload leaves
+# Distance of a common factor from 1 over the share of gravity that it leaves, and largest ratio of
+# that share to the one that a payload leaves.
+_CLEARLY, _BETTER = 4.0, 0.5
 _TOTAL = "total mass"
 _ABSORBS = 0.1  # share of a change of a stated mass that a link takes up to be named
 
