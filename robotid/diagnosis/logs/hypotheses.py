@@ -16,12 +16,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process, resolve, unwrap
 from robotid.diagnosis.decisions import TINY
 from robotid.diagnosis.logs.channels import AT_REST, ZERO
-from robotid.dynamics.rows import (
-    drive_values,
-    friction_directions,
-    friction_speeds,
-    inertial_rows,
-)
+from robotid.dynamics.rows import drive_values, friction_directions, friction_speeds, inertial_rows
 from robotid.robot.model import GRAVITY, RobotModel
 
 #: Decrease of the misfit from which another gravity is reported.
