@@ -94,7 +94,6 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
 
 def _flags(model: RobotModel, log: Log, whole: Log, t: Array) -> Array:
     """Return whether each contact of a log is in contact at times, shape (N, contacts), bool."""
-    # ``whole`` is the log with the contacts that were found.
     flags = np.ones((len(t), len(model.contacts)), dtype=bool)
     for k, contact in enumerate(model.contacts):
         if contact.is_measured:
@@ -106,8 +105,7 @@ def _flags(model: RobotModel, log: Log, whole: Log, t: Array) -> Array:
 
 def check_wrenches(model: RobotModel, log: str, motion: Trajectory) -> Iterator[Finding]:
     """Yield a finding if measured forces have another sign or unit."""
-    # With the bodies of the URDF, W pi = J^T f in the rows of a floating base, less unknown forces.
-    # The factor of f with the smallest residual is -1, or another unit.
+    # W pi = J^T f in the rows of a floating base, less unknown forces; the best factor is not 1.
     if motion.wrenches is None or not any(x.measured for x in model.contacts):
         return
     every = max(1, len(motion.t) // _MOST)
@@ -207,7 +205,7 @@ def _contact_jacobian(model: RobotModel, q: Array) -> tuple[Array, Array]:
 
 def _radius(stated: float, v: Array, rolls: Array) -> tuple[float, float, float] | None:
     """Return the radius of a foot in contact that rolls as a ball of another one than stated."""
-    # With it are the median speeds with the stated radius and with this one.
+    # With the median speeds with the stated radius and with it.
     if not rolls.any():
         return None
     # weighted median of v / roll: the smallest sum of |v - change roll|, samples that slip apart
@@ -255,8 +253,7 @@ def check_unit(log: Log) -> Iterator[Finding]:
 
 def check_twist(log: Log, signals: SignalSettings) -> Iterator[Finding]:
     """Yield a finding if the measured twist is not that of the pose, with the axes of the base."""
-    # Both pass the filter of the motion. If another reading of the quaternion explains the twist,
-    # the quaternion is wrong.
+    # Both are filtered alike; another reading of the quaternion may explain the twist.
     base = log.base
     if base is None or base.twist is None or base.imu is not None:
         return
@@ -285,8 +282,7 @@ def check_twist(log: Log, signals: SignalSettings) -> Iterator[Finding]:
         causes = {key: axes[what][key] for key in ("world", "base")}
         causes["unit"] = rms(factor * twist[:, part] - wanted[:, part])
         turned = {key: rms((twist - x)[:, part]) for key, x in readings.items()}
-        cause = min(causes | turned, key=lambda key: (causes | turned)[key])
-        best = (causes | turned)[cause]
+        best, cause = min((left, key) for key, left in (causes | turned).items())
         is_explained = best < _BETTER * off
         if size < _NOISE or off < (_SOME if is_explained else _UNLIKE) * size:
             continue
@@ -352,11 +348,9 @@ class _Feet:
 
 def check_order(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[Finding]:
     """Yield a finding if feet on the ground hardly move with another reading of the quaternion."""
-    # The slowest foot of each sample is taken to be on the ground, whatever its flags. Tried are
-    # another order of the quaternion and its inverse; the base must be above the feet. Without
-    # position the feet hardly move relative to each other. A world with another vertical axis is
-    # found, too: the base is above the feet along it. A tilt that is constant moves no foot, and is
-    # not found: it looks like a slope.
+    # The slowest foot of each sample is on the ground, whatever its flags; without position, feet
+    # hardly move relative to each other. The base is above the feet, along any axis of the world. A
+    # constant tilt moves no foot, and looks like a slope: it is not found.
     if log.base is None or not model.contacts or len(motion.t) < 3:
         return
     frames = [x.frame for x in model.contacts]
@@ -431,7 +425,6 @@ def check_imu(log: Log, motion: Trajectory) -> Iterator[Finding]:
 
 def _check_gyroscopes(log: Log, motion: Trajectory) -> Iterator[Finding]:
     """Yield a finding if the angular velocity is not that of the orientation."""
-    # Another reading of the quaternion, or deg/s, may explain it.
     w, place, quaternion = motion.v[:, 3:6], motion.q[:, :3], motion.q[:, 3:7]
 
     def off(x: Array, q: Array = quaternion) -> float:

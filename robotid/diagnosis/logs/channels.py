@@ -185,8 +185,7 @@ def _velocity_scale(
     log: Log, slope: Array, v: Array, alike: Array, velocity: str
 ) -> Iterator[Finding]:
     """Yield measured velocities that are a multiple of d(q)/dt, or constant."""
-    # The factor lies between the slope of the regression of v on d(q)/dt and the inverse of the
-    # slope of the regression of d(q)/dt on v, for any noise in the two.
+    # It lies between the slopes of the regressions of v on d(q)/dt, and inverse, for any noise.
     slope, v = slope - slope.mean(axis=0), v - v.mean(axis=0)
     severity = {"differentiated": "note", "auto": "error" if log.has_torque else "warning"}
     for j, joint in enumerate(log.joints):
@@ -363,8 +362,7 @@ def _stale_rows(log: Log, step: Array) -> Iterator[Finding]:
 
 def _in_motion(log: Log, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
     """Return the runs of repeated rows within a motion that continues or catches up after them."""
-    # A robot that holds a position starts again from rest, and without further channels, a single
-    # step of the encoder is that of a slow motion.
+    # After holding a position it starts from rest; a single encoder step is that of a slow motion.
     t, q, last_row = log.t, log.q, len(log.t) - 1
     first, last = np.array([run for run in runs if run[1] < last_row], dtype=int).reshape(-1, 2).T
     n = last - first + 1
@@ -421,8 +419,7 @@ def _touches(x: Array) -> int:
 
 def _held(log: Log) -> Iterator[Finding]:
     """Yield the joints whose torque is updated less often than logged while the robot moves."""
-    # Rows that repeat in every channel are a fault of the logger and reported elsewhere; a
-    # quantised torque is constant for irregular times.
+    # Rows that repeat in every channel are a fault of the logger; quantisation repeats irregularly.
     fresh = np.append(True, (np.diff(log.q, axis=0) != 0).any(axis=1))
     lengths = np.array([_hold(x) for x in log.tau[fresh].T])
     for length in np.unique(lengths[lengths > 1]):

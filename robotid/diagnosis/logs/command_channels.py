@@ -119,8 +119,7 @@ class _Loop:
     @cached_property
     def response(self) -> tuple[Array, Array, Array]:
         """Frequency response from command to position: frequency [Hz], response, weight."""
-        # Only frequencies that the command excites are used. The weight is the inverse of the
-        # relative variance, from the coherence.
+        # Where the command excites it. The weight is 1 / relative variance, from the coherence.
         from scipy.signal import csd, welch
 
         n = min(len(self.q), max(8, round(_SECONDS / self.step)))
@@ -149,8 +148,7 @@ class _Loop:
     @cached_property
     def lag(self) -> tuple[float, float]:
         """Delay of the position within the bandwidth, and its standard error [s]."""
-        # It is the lag of the largest correlation of their changes, plus the weighted mean of the
-        # remaining phase over the frequency; nan if nothing is excited.
+        # The lag of the largest correlation, plus the weighted mean of phase / frequency left.
         f, H, weight = self.response
         first = self._first_lag()
         phase = np.angle(H * np.exp(2j * np.pi * f * first))
@@ -165,8 +163,7 @@ class _Loop:
 
     def _first_lag(self) -> float:
         """Return the lag at which changes of position and command correlate most [s]."""
-        # Of several lags with about this correlation, as for a sine, it is the shortest; nan if
-        # none is positive.
+        # The shortest of lags with about this correlation, as of a sine; nan if none is positive.
         from scipy.signal import correlate
 
         alike = correlate(np.diff(self.q), np.diff(self.command), method="fft")
@@ -181,8 +178,7 @@ class _Loop:
     @cached_property
     def delays(self) -> tuple[float, float]:
         """The shortest and the longest pure delay that are consistent with the response [s]."""
-        # H = exp(-i w T) / (g + d i w - j w^2), in which g, d and j are linear for each T; as d is
-        # not negative, T is at most the lag.
+        # H = exp(-i w T) / (g + d i w - j w^2), linear in g, d, j for each T; T <= lag: d >= 0.
         f, H, weight = self.response
         lag, error = self.lag
         delays = _DELAYS[max(lag + 2 * error, 0.0) >= _DELAYS] if np.isfinite(lag) else _DELAYS

@@ -75,8 +75,7 @@ class _Reading:
 
 def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
     """Yield the faults of signs, columns, gravity or URDF that keep the torques from fitting."""
-    # Only the reading that explains the torques best is reported; if it is the stated one, the
-    # URDF's masses are checked.
+    # Only the best reading is reported; if it is the stated one, the URDF's masses are checked.
     stated, loaded, others = explanations(probe)
     best = min(others, key=lambda e: e.misfit)
     if best.kind not in _SIGNS and loaded.misfit < best.misfit:
@@ -244,8 +243,7 @@ def load_model(probe: Probe, share: Array, level: Array | None = None) -> LoadMo
 
 def _check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
     """Yield torques in another scale, a payload, a URDF of another robot."""
-    # Another scale is accepted if the torques then fit with about the URDF's masses; else the URDF
-    # is of another robot.
+    # Another scale must fit with about the URDF's masses; else the URDF is of another robot.
     model, ones = load_model(probe, share), np.ones(len(share))
     bodies = len(probe.model.layout.bodies)
     _, theta, error = model.fit(ones)
@@ -292,8 +290,7 @@ def _error_of_links(theta: Array) -> float:
 
 def _torque_scales(model: LoadModel) -> Array:
     """Return the factors of the torque columns that reduce the misfit significantly, else 1."""
-    # One round after the other, of all torques by a factor that errors of masses do not explain, or
-    # of one torque more.
+    # In rounds: all torques by a factor that no errors of masses explain, or one torque more.
     n, scale = len(model.R), np.ones(len(model.R))
     common = _SCALES[np.abs(np.log(_SCALES)) > np.log(NO_ERROR_OF_MASSES)]
     for _ in range(n):
@@ -369,9 +366,7 @@ def check_payload_change(
     validation: Sequence[Reduction], independent: float, name: str,
 ) -> Iterator[Finding]:  # fmt: skip
     """Yield a warning if a validation log has another load than the fitted ones."""
-    # Both are fitted together, with free parameters of all links and a load in the last link of the
-    # validation log only. The load is reported if the same robot with it fits both. ``independent``
-    # is the number of independent samples.
+    # Both logs are fitted together, with a load in the last link of the validation log only.
     layout, every = model.layout, (*fitted, *validation)
     squares, samples = sum(r.squares for r in every), sum(r.samples for r in every)
     size = payload_spread(model)

@@ -183,8 +183,7 @@ def _carrying(tree: Tree) -> set[str]:
 
 def audit_links(model: RobotModel) -> Iterator[Finding]:
     """Yield implausible inertials of a robot."""
-    # A body is a moving link with all links that are fixed to it. The collision geometry is used,
-    # or the visual one; a body whose geometry cannot be read is not checked.
+    # A body is a moving link with all links fixed to it; without readable geometry it is skipped.
     yield from _templates(model)
     points = body_points(model)
     yield from audit_bodies(model, model.standard_parameters(), points)
@@ -255,8 +254,7 @@ def _against_geometry(body: str, J: Array, points: Array) -> Iterator[Finding]:
 
 def _against_kinematics(body: str, J: Array, length: float, longest: float) -> Iterator[Finding]:
     """Yield the parameters of a body without geometry that are impossible for its length [m]."""
-    # A body may be wide where its joints are close: warnings need more than the longest of all
-    # bodies allows.
+    # Wide bodies have close joints: warnings need more than the longest of all bodies allows.
     of_link, centre = {"subject": f"link {body}", "link": body}, J[:3, 3] / J[3, 3]
     distance = float(np.linalg.norm(centre))
     if distance > max(length, longest):
