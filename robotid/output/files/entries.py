@@ -15,7 +15,7 @@ from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.drive_terms import DriveChoice
 from robotid.estimation.fitting.evaluation import LEFT_OUT, Evaluated, Evaluation
-from robotid.estimation.fitting.fitted import SOURCES, Identified, next_errors, typical_friction
+from robotid.estimation.fitting.fitted import SOURCES, Identified, next_errors
 from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.output.files.ranges import covariance_entry, parameter_ranges
@@ -185,7 +185,7 @@ def _curve(found: TorqueIdentification, joint: str) -> dict[str, Any]:
     speeds = [e.recording.trajectory.v[e.recording.mask[:, row], row] for e in found.fitted]
     if not np.any(np.concatenate(speeds)):
         return {}
-    return {"curve": typical_friction(found, joint).to_dict()}
+    return {"curve": found.friction(joint).to_dict()}
 
 
 def _structure(found: Identified) -> dict[str, Any]:
