@@ -26,7 +26,7 @@ from robotid.dynamics.simulation.loops import (
 from robotid.dynamics.simulation.simulation_settings import by_joint
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import OutputError
-from robotid.estimation.fitting.estimator_settings import SimulationSettings
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings, SimulationSettings
 from robotid.identification.closed_loop.further_parameters import (
     GainScale,
     Tried,
@@ -60,7 +60,7 @@ from robotid.identification.closed_loop.loop_simulator import (
     with_terms,
 )
 from robotid.identification.closed_loop.position_errors import DRIFTS
-from robotid.identification.pipeline import identify
+from robotid.identification.pipeline import conclude, in_memory
 from robotid.identification.result import TorqueIdentification
 from robotid.robot.model import RobotModel
 
@@ -116,7 +116,7 @@ def fit_loops(
     progress: ProgressCallback = ignore_progress,
 ) -> Fitted:
     """Fit drives, loops and bodies to logs of commands and positions."""
-    task = _Task(model, logs, loop, settings, signals, progress)
+    task = _Task(model, logs, loop, settings, signals or SignalSettings(), progress)
     _check_logs(logs, loop, settings)
     initialise = _initialise_from_torque if loop.kind == "torque" else _initialise_from_commands
     initialised, theta = _best_start(initialise(task))
@@ -179,7 +179,7 @@ class _Task:
     logs: Sequence[Log]
     loop: LoopSettings
     settings: SimulationSettings
-    signals: SignalSettings | None
+    signals: SignalSettings
     progress: ProgressCallback
 
     def windows(self, logs: Sequence[Log], length: float, lead: float) -> tuple[Window, ...]:
@@ -190,7 +190,8 @@ class _Task:
 
     def from_rows(self, model: RobotModel) -> TorqueIdentification:
         """Return the identification from the torques alone, with the model's friction terms."""
-        return identify(model, self.logs, signals=self.signals, friction="none", doctor=False)
+        recordings = in_memory(model, self.signals, self.logs)
+        return conclude(recordings, EstimatorSettings(), friction="none")
 
     def bodies(self, robot: ClosedLoopRobot) -> list[FreeParameter]:
         """Return the free parameters of bodies."""
