@@ -63,8 +63,7 @@ class Payload:
     def inertia_at_link(self) -> Array:
         """Inertia about the origin of the link's frame, shape (3, 3) [kg m^2]."""
         c = self.com
-        inertia: Array = self.inertia + self.mass * (c @ c * np.eye(3) - np.outer(c, c))
-        return inertia
+        return np.asarray(self.inertia + self.mass * (c @ c * np.eye(3) - np.outer(c, c)))
 
     @property
     def parameters(self) -> Array:
@@ -285,10 +284,8 @@ def fit_with_friction(
     masses: Mapping[str, float],
     unknown_gains: Sequence[str] = (),
 ) -> PayloadFit:
-    """Identify payloads with the friction that the reference shows, and check known masses.
-
-    Friction is a torque, not a current: ``rescaled`` returns the reference with identified gains.
-    """
+    """Identify payloads with the friction that the reference shows, and check known masses."""
+    # friction is a torque, not a current: ``rescaled`` returns the reference with identified gains
     fitted = partial(fit_payloads, links=links, masses=masses, unknown_gains=unknown_gains)
     fit = fitted(loaded, reference)
     gains = {joint: gain.value for joint, gain in fit.gains.items()}

@@ -92,7 +92,7 @@ def test_designs_are_the_same_under_a_seed_and_stop_when_told(designer):
         for progress in (None, lambda *call: told.append(call))
     )
     assert [start for start, _ in told] == [0, 1]  # as it starts, and before the finer grid
-    assert told[0][1] == other.history[0][1]
+    assert told[-1][1] == pytest.approx(other.objective, abs=0.05)
     np.testing.assert_array_equal(one.motion.coefficients, other.motion.coefficients)
     assert not one.is_converged
     assert one.used.max() <= 1.0
