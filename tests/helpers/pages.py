@@ -90,10 +90,10 @@ def charts(html):
         r'<figure class="chart">.*?<script type="application/json">(.*?)</script>', html, re.DOTALL
     ):
         what = json.loads(text)
-        what["x"] = unpacked(what["x"])
+        what["x"] = numbers_of(what["x"])
         for series in what["series"]:
-            series["y"] = unpacked(series["y"])
-            series["half"] = None if series["half"] is None else unpacked(series["half"])
+            series["y"] = numbers_of(series["y"])
+            series["half"] = None if series["half"] is None else numbers_of(series["half"])
         found.append(what)
     return found
 
@@ -104,13 +104,15 @@ def chart(html, title):
     return found
 
 
-def unpacked(packed):
-    """Return the numbers of an array in a page, the last code as NaN."""
-    codes = np.frombuffer(base64.b64decode(packed["data"]), f"<u{packed['bits'] // 8}")
-    last = 2 ** packed["bits"] - 1
-    values = packed["low"] + codes / (last - 1) * (packed["high"] - packed["low"])
-    values = np.where(codes == last, np.nan, values)
-    return 10.0**values if packed["log"] else values
+def numbers_of(packed):
+    """Return the numbers of an array in a page; of steps, the last code is NaN."""
+    codes = np.frombuffer(base64.b64decode(packed["data"]), packed["kind"])
+    codes = codes.reshape(packed["shape"])
+    if "step" not in packed:
+        return codes
+    values = np.array(packed["low"]) + np.array(packed["step"]) * codes
+    values = np.where(codes == np.iinfo(codes.dtype).max, np.nan, values)
+    return 10.0**values if packed.get("log") else values
 
 
 def bars(html):
