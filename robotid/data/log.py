@@ -1,7 +1,4 @@
-"""Motion of a robot as arrays: `Log`, the recording, and `Trajectory`, the input of a fit.
-
-Files are read and written by `robotid.data.files.read`.
-"""
+"""Motion of a robot as arrays: `Log`, the recording, and `Trajectory`, the input of a fit."""
 
 import difflib
 import tempfile

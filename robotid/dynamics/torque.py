@@ -76,21 +76,6 @@ def trajectory_regressor(
     return Y.reshape(len(m.t) * model.n_rows, -1)
 
 
-def mass_regressor(model: RobotModel, q: Array) -> Array:
-    """Return the regressor of D(q, pi) = mass_regressor @ pi, shape (N, n_rows, n_rows, p).
-
-    Column j is W(q, 0, e_j) - W(q, 0, 0), where gravity and offsets cancel (Tzvetkova, (11), (13)).
-    """
-    N, n = len(q), model.n_rows
-    still = np.zeros((N, n))
-    at_rest = joint_torque_regressor(model, q, still, still).reshape(N, n, -1)
-    D = np.empty((N, n, n, at_rest.shape[2]))
-    for j in range(n):
-        unit = still + np.eye(n)[j]
-        D[:, :, j] = joint_torque_regressor(model, q, still, unit).reshape(N, n, -1) - at_rest
-    return D
-
-
 class InstantRegressor:
     """Some columns (c,) of the regressor, one sample at a time, without repeated initialisation."""
 
@@ -137,7 +122,6 @@ def build_problem(
     trajectory: Trajectory,
     weight: Array | None = None,
     *,
-    with_mass: bool = False,
     compiled: bool | None = None,
 ) -> Problem:
     """Return the problem W pi = tau of a trajectory: a stream of row blocks with p columns.
@@ -171,15 +155,8 @@ def build_problem(
                 W = without_forces(m.basis[part], Y).reshape(W.shape)
             yield W, trajectory.tau[part].reshape(-1), weights[part].reshape(-1)
 
-    def mass_stream() -> Iterator[Array]:
-        for start in range(0, samples, length):
-            yield mass_regressor(model, trajectory.q[start : start + length])
-
-    masses = mass_stream if with_mass else None
-    return Problem(
-        stream, model.layout.names, model.n_rows, support, masses, (source,),
-        is_projected=trajectory.basis is not None,
-    )  # fmt: skip
+    is_projected = trajectory.basis is not None
+    return Problem(stream, model.layout.names, model.n_rows, support, (source,), is_projected)
 
 
 def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) -> Array:

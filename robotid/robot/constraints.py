@@ -168,10 +168,7 @@ class Loop(Settings):
         return np.vstack([relative[:3], self._across(placement.rotation) @ relative[3:]])
 
     def error(self, placements: Sequence[pin.SE3]) -> Array:
-        """Return the displacement that the loop prevents, shape (m,) [m, rad]; 0 if it is closed.
-
-        Its rate is the prevented velocity, if it is small.
-        """
+        """Return the displacement that the loop prevents, (m,) [m, rad]; 0 if it is closed."""
         first, second = placements
         displacement = np.zeros(self.sizes[self.kind])
         displacement[:3] = first.translation - second.translation
@@ -184,10 +181,7 @@ class Loop(Settings):
         return displacement
 
     def drift(self, accelerations: Sequence[Array], speeds: Sequence[Array], R: Array) -> Array:
-        """Return the prevented acceleration dJ/dt v without accelerations of joints, shape (m,).
-
-        R are the axes of the first frame; speeds, of both frames, are angular velocities (3,).
-        """
+        """Return dJ/dt v, (m,): R are the first frame's axes, speeds angular velocities (3,)."""
         relative = accelerations[0] - accelerations[1]  # axes of the world, (6,)
         if self.kind != "hinge":
             return relative[: self.sizes[self.kind]]

@@ -1,9 +1,4 @@
-"""The only parser of URDFs in the package: links, inertials and joints.
-
-Pinocchio's parser requires valid geometry, limits and ``<dynamics>``, which the dynamics do not
-use, and only prints its errors. So the XML is read here, each relevant fault raises an error, and
-Pinocchio receives only the kinematic tree, with the numbers read here.
-"""
+"""The only parser of URDFs: each fault raises an error; Pinocchio receives the tree alone."""
 
 import copy
 import difflib
@@ -67,10 +62,7 @@ class Joint:
 
     @property
     def has_limits(self) -> bool:
-        """Whether the URDF states a range of positions.
-
-        lower = upper = 0 counts as none, and so does a range of 200 rad or more.
-        """
+        """Whether the URDF states a range of positions; 0 and 200 rad or more count as none."""
         return 0.0 < self.upper - self.lower < _ENDLESS
 
     @property

@@ -1,7 +1,4 @@
-"""The text of a URDF: checked XML, numbers, rounded angles.
-
-All numbers of URDFs are read here, so that a text is a number in all places or in none.
-"""
+"""The text of a URDF: checked XML, numbers, rounded angles."""
 
 import logging
 import math
@@ -111,10 +108,8 @@ def read_numbers(
 def exact_angle(word: str) -> float | None:
     """Return the multiple of pi/12 that an angle approximates, None if it is not a rounded one.
 
-    An angle is a rounded one if the multiple, rounded or truncated to its number of decimals, is
-    equal to it: 3.14, 3.1416 and 3.1415 for pi. Multiples of pi/2 need two decimals, others four.
-    So is an angle within 2e-5 rad of a multiple: 3.14158. A calibrated angle, such as 1.570912,
-    differs from pi/2 in its decimals, and is not a rounded one.
+    The multiple, rounded or truncated to the angle's decimals (two for pi/2, else four), is equal
+    to it, as 3.1415; or they are within 2e-5 rad. A calibrated angle, as 1.570912, is none.
     """
     values = numbers(word, 1)
     twelfths = round(values[0] / (math.pi / 12)) if values else 0

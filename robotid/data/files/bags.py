@@ -1,8 +1,4 @@
-"""Bags of ROS 1 and ROS 2, including MCAP: joints, commands and sensors as a table of columns.
-
-A row is a message of the joints; columns of sensors are interpolated. The library rosbags reads all
-bags; ROS need not be installed.
-"""
+"""Bags of ROS 1 and 2, MCAP included: a row is a message of joints; sensors are interpolated."""
 
 import re
 from array import array
@@ -92,9 +88,7 @@ def _open(path: Path, source: LogSource) -> Table:
     """Return the table of a .mcap, .db3 or .bag file, or of the folder of a ROS 2 bag.
 
     Columns are ``time`` [s] since the epoch, ``position_<joint>``, ``velocity_<joint>`` and
-    ``effort_<joint>``; of Unitree's LowState by the number of the motor. Messages without any
-    required column are ignored; one with only some of them is a ``DataError``. Commands are those
-    of a controller's state (``_controlled``), or of a second topic, by a zero-order hold.
+    ``effort_<joint>``; of Unitree's LowState by the number of the motor.
     """
     with _opened(path, source) as bag:
         sensors = _sensors_of(bag)
@@ -277,11 +271,7 @@ def _content(
 
 
 def _controlled(message: Any) -> dict[str, Any]:  # noqa: ANN401
-    """Return the fields of a controller's state; a field with NaN only is empty.
-
-    Commands are its output to the drives, else its reference; the effort is that of the reference.
-    Up to control_msgs 4 its points were called desired and actual.
-    """
+    """Return the fields of a controller's state, also up to control_msgs 4; NaN only is empty."""
 
     def first(name: str, *points: str) -> Any:  # noqa: ANN401
         candidates = (getattr(getattr(message, point, None), name, ()) for point in points)

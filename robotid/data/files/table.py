@@ -1,8 +1,4 @@
-"""The common form of all file formats: named columns, read as a whole or row by row.
-
-Columns with names of other programs (PlotJuggler, rostopic, DataFrames), stamps in two columns and
-stamps with equal steps are columns that are computed from others.
-"""
+"""The common form of all file formats: named columns, read as a whole or row by row."""
 
 import re
 from abc import ABC, abstractmethod
@@ -201,11 +197,7 @@ def _numbers(values: Any, name: str) -> Array:  # noqa: ANN401
 
 
 def with_standard_names(table: Table, where: str, kind: str, source: LogSource) -> Table:
-    """Return a table with the columns of PlotJuggler renamed to standard names.
-
-    ``/joint_states/elbow/position`` becomes ``position_elbow``, likewise velocity, acceleration and
-    effort, and ``__time`` becomes ``time``. A table with standard columns is not changed.
-    """
+    """Return a table with PlotJuggler's ``/topic/elbow/position`` as ``position_elbow``."""
     topics: dict[str, dict[str, str]] = {}  # standard names by name in the file, by topic
     is_standard = any(name.startswith(("q_", "position_")) for name in table.names)
     for name in table.names if _CLOCK in table.names or not is_standard else ():

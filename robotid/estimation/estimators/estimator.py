@@ -89,11 +89,6 @@ class Estimator(ABC, Generic[DataT]):
     reads: ClassVar[Literal["factors", "samples", "simulator"]]
 
     @property
-    def needs_mass(self) -> bool:
-        """Whether each sample must have the regressor of the mass matrix."""
-        return False
-
-    @property
     def weighing(self) -> Weighing:
         """Weights of the rows, which determine how standard errors follow from their scatter."""
         return "by joint"

@@ -5,7 +5,7 @@ from abc import abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from statistics import NormalDist
-from typing import ClassVar, Generic, Literal, TypeAlias, TypeVar
+from typing import ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
 from scipy.linalg.lapack import dtpqrt
@@ -26,14 +26,11 @@ from robotid.estimation.estimators.estimator import (
 )
 
 StateT = TypeVar("StateT")
-#: Rows of a sample: all, or the indices of the rows of positive weight.
-Rows: TypeAlias = slice | Array
 
 _BLOCK = 8  # block size of LAPACK
 _PATIENCE = 50  # largest number of successive rows of a joint that the gate rejects
 _AVERAGE = 3.0  # weight of the newest iterate: 3 / (k + 2), the initial value decays as k^-3
 _MEMORY = 1000.0  # [samples] over which PRX and the residuals are averaged
-_SMALLEST = 1e-6  # lower bound of the eigenvalues of D(q, P^), relative to the largest
 _NO_PRX = 1e-9  # norm of the moving average of PRX below which it is 0, scaled parameters
 _GAIN = 0.01  # relative decrease of the squared residual per pass at convergence
 
@@ -364,7 +361,7 @@ class Descent(RecursiveEstimator[DescentState]):
         return "by step"
 
     @abstractmethod
-    def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
+    def _moved(self, x: Array, Psi: Array, e: Array) -> Array:
         """Return x, shape (c,), after rows Psi (k, c), residuals e (k,), both in units of noise."""
 
     def init(self, c: int) -> DescentState:
@@ -382,7 +379,7 @@ class Descent(RecursiveEstimator[DescentState]):
             return replace(state, steps=steps, skipped=state.skipped + 1)
         # usually all rows are used, and a slice is fast
         used = slice(None) if len(rows) == len(sigma) else np.flatnonzero(sample.weight)
-        x = self._moved(state.x, Psi, Psi @ state.x - tau, used, sample)
+        x = self._moved(state.x, Psi, Psi @ state.x - tau)
         newest = _AVERAGE / (steps + _AVERAGE - 1)
         mean = state.mean + (x - state.mean) * newest if self.average else x
         # residual of this sample for the averaged estimate before it
@@ -411,7 +408,7 @@ class Descent(RecursiveEstimator[DescentState]):
 
     def fit(self, data: Problem) -> Estimate:
         estimator, c = self, len(data.names)
-        if self.scale is None and not self.needs_mass:
+        if self.scale is None:
             estimator = replace(self, scale=column_scale(data, self.sigma))
         state, settled = estimator.init(c), False
         for _ in range(self.passes):
@@ -453,68 +450,28 @@ class NormalisedGradient(Descent):
     Control, 3.3.
     """
 
-    def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
+    def _moved(self, x: Array, Psi: Array, e: Array) -> Array:
         return x - 1.0 / np.vdot(Psi, Psi) * (e @ Psi)
 
 
 @dataclass(frozen=True, eq=False)
 class PRX(Descent):
-    """The paper's update P^ <- P^ - gamma Psi^T eta (24), with e = Psi P^ - tau.
+    """The paper's update P^ <- P^ - gamma Psi^T e (24), with e = Psi P^ - tau and the exact step.
 
-    * step "printed": eta = D^-1 e, gamma = sigma_D / |Psi|_F^2, sigma_D the smallest eigenvalue of
-      D(q, P^). For an arm with six joints the steps are very small.
-    * step "exact": eta = e, rows in units of their noise; gamma = e^T e / |Psi^T e|^2, the
-      minimiser of |P~| along the direction.
-
-    Without noise |P~| does not increase: with "exact" always, with "printed" if
-    sigma_min(D(q, P^)) <= 2 sigma_min(D(q, P)). With column scaling this is the norm of scale * P~.
+    Rows are in units of their noise; gamma = e^T e / |Psi^T e|^2 is the minimiser of |P~| along the
+    direction. Without noise |P~| does not increase; with column scaling it is the norm of
+    scale * P~.
 
     With noise each iterate changes by about the noise of its sample: on recordings of a UR10e and a
     Panda the prediction error of the last iterate is 1.3 to 1.9 times that of weighted least
-    squares, and that of the average, the k-th iterate weighted by k^2, 1.03 to 1.05 times. ``fit``
-    scales the columns for step "exact" only. Tzvetkova, Extracting Inertial Parameters from Robotic
-    Manipulators Dynamics, (20)-(25).
+    squares, and that of the average, the k-th iterate weighted by k^2, 1.03 to 1.05 times.
+    Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (20)-(25).
     """
 
-    step: str = "exact"  # or "printed"
-
-    def __post_init__(self) -> None:
-        if self.step not in ("exact", "printed"):
-            raise DataError(f"step is {self.step!r}, wanted 'exact' or 'printed'")
-
-    @property
-    def needs_mass(self) -> bool:
-        return self.step == "printed"
-
-    def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
-        if self.step == "exact":
-            direction = e @ Psi
-            square = direction @ direction
-            return x - ((e @ e) / square if square > 0 else 0.0) * direction
-        Psi = sample.Y[used] / self._unit  # rows as in the paper
-        values, vectors = self._inertia(x, sample)
-        e = np.zeros(len(values))
-        e[used] = Psi @ x - sample.tau[used]
-        eta = vectors @ ((e @ vectors) / values)  # D^-1 e (20)
-        gamma = values[0] / np.vdot(Psi, Psi)  # sigma_D / |Psi|_F^2
-        return np.asarray(x - gamma * (eta[used] @ Psi))  # (24)
-
-    def _inertia(self, x: Array, sample: Sample) -> tuple[Array, Array]:
-        """Return eigenvalues and eigenvectors of D(q, P^), which is linear in P^ (11).
-
-        The proof needs a positive definite D: smaller eigenvalues are replaced by a positive bound.
-        """
-        if sample.mass_regressor is None:
-            raise DataError(
-                "PRX needs the mass regressor of each sample, found none; build the problem with "
-                "build_problem(..., with_mass=True)"
-            )
-        D = sample.mass_regressor @ (x / self._unit)  # (n, n)
-        if not np.isfinite(D).all():
-            raise DataError("the mass regressor of the sample is not finite; it was not used")
-        values, vectors = np.linalg.eigh((D + D.T) / 2)
-        largest = float(np.abs(values).max())
-        return np.maximum(values, _SMALLEST * largest if largest > 0 else 1.0), vectors
+    def _moved(self, x: Array, Psi: Array, e: Array) -> Array:
+        direction = e @ Psi
+        square = direction @ direction
+        return x - ((e @ e) / square if square > 0 else 0.0) * direction
 
 
 def column_scale(problem: Problem, sigma: Array) -> Array:
