@@ -89,13 +89,11 @@ def test_the_limit_of_a_drive_that_bears_a_load_is_found_beyond_the_load(tmp_pat
 def test_the_model_of_some_joints_is_that_of_another_fit(rng):
     base = stated_loops(RobotModel.from_urdf(URDF / "planar_2r.urdf"), LoopSettings(kp=1.0))
     keys, terms = ("armature", "delay", "limit"), ((Viscous(), Coulomb(), Offset()),) * 2
-    models = [
-        SecondOrder(
-            replace(base, terms=terms, values=rng.random(6), **{key: rng.random(2) for key in keys}),
-            rng.random(2), rng.random(2),
-        )
-        for _ in range(2)
-    ]  # fmt: skip
+    models = []
+    for _ in range(2):
+        drawn = {key: rng.random(2) for key in keys}
+        loops = replace(base, terms=terms, values=rng.random(6), **drawn)
+        models.append(SecondOrder(loops, rng.random(2), rng.random(2)))
     mixed, (one, other) = models[0].replaced(models[1], np.array([False, True])), models
     for key in (*keys, "values"):
         a, b, found = (getattr(x.loops, key) for x in (one, other, mixed))
