@@ -164,11 +164,9 @@ def select(
 
 
 def p_value(before: Array, after: Array, fitted: int) -> float:
-    """Return the p-value of a reduction of the squared residuals of segments [-].
-
-    Student's test of the mean of their shares, each between -1 and 1, over the segments of fitted
-    logs or over all, whichever p-value is smaller. Segments with the joint at rest do not count.
-    """
+    """Return the p-value of a reduction of the squared residuals of segments [-]."""
+    # Student's test of the mean of their shares, each between -1 and 1, over the segments of fitted
+    # logs or over all, whichever p-value is smaller. Segments with the joint at rest do not count.
     return min(_student(before[:k], after[:k]) for k in {fitted, len(before)})
 
 

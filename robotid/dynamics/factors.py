@@ -24,7 +24,6 @@ import scipy.linalg.lapack
 
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
-from robotid.data.log import Trajectory
 from robotid.dynamics.problem import Problem, RowSource
 
 ItemT = TypeVar("ItemT")
@@ -142,13 +141,6 @@ class Reduction:
     squares: Array  # sums of tau^2, v^2 and a^2 over all samples, used or not, shape (3, n_rows)
     samples: int  # number of these samples
 
-    @classmethod
-    def of(
-        cls, problem: Problem, trajectory: Trajectory, *, threads: int | None = None
-    ) -> "Reduction":
-        """Reduce the problem of one trajectory."""
-        return cls(compress(problem, threads=threads), trajectory.squares, len(trajectory.t))
-
 
 def compress(problem: Problem, *, threads: int | None = None) -> Factors:
     """Fold a problem into its factors, block by block.
@@ -159,8 +151,13 @@ def compress(problem: Problem, *, threads: int | None = None) -> Factors:
     """
     columns = [np.flatnonzero(row) for row in problem.support]
     triangles = [Triangle(len(own) + 1) for own in columns]
+    for source in problem.sources:
+        places = _places(source, columns)
+        for part in _folded(source, _PART, _PART, threads):
+            for triangle, place, R_j in zip(triangles, places, part, strict=True):
+                triangle.fold_triangle(R_j, place)
     if problem.sources:
-        rows = _fold_sources(triangles, columns, problem.sources, threads)
+        rows = np.sum([source.rows(0, source.samples) for source in problem.sources], axis=0)
     else:
         rows = _fold_blocks(triangles, columns, problem)
     return _factors_of([triangle.R for triangle in triangles], columns, rows, problem)
@@ -362,21 +359,6 @@ def _fold_blocks(
             scaled *= root[used, j, None]
             triangles[j].fold(scaled)
     return rows
-
-
-def _fold_sources(
-    triangles: Sequence[Triangle],
-    columns: Sequence[Array],
-    sources: Sequence[RowSource],
-    threads: int | None,
-) -> Array:
-    """Fold each source into the factors, part by part; return the number of rows per joint."""
-    for source in sources:
-        places = _places(source, columns)
-        for part in _folded(source, _PART, _PART, threads):
-            for triangle, place, R_j in zip(triangles, places, part, strict=True):
-                triangle.fold_triangle(R_j, place)
-    return np.asarray(np.sum([source.rows(0, source.samples) for source in sources], axis=0))
 
 
 def _places(source: RowSource, columns: Sequence[Array]) -> list[Array]:

@@ -340,8 +340,7 @@ def _load_torque(model: RobotModel, trajectory: Trajectory) -> Array:
 
 def _drive_motion(model: RobotModel, trajectory: Trajectory, has_rate: bool) -> DriveMotion:
     """Return the motion and load of drives as of ``drive_motion_along``."""
-    layout, pi = model.layout, model.carried_by
-    m = trajectory.with_states(None)  # that of another reference, if it has one
+    layout, m = model.layout, trajectory.with_states(None)  # that of another reference, if any
     first = model.n_rows - len(model.joints)
     signs = friction_directions(layout, m.v, m.direction)
     begins = np.diff(m.segment, prepend=m.segment[:1] - 1) != 0
@@ -351,8 +350,7 @@ def _drive_motion(model: RobotModel, trajectory: Trajectory, has_rate: bool) -> 
         return motion
     if layout.remembering:
         m = m.with_states(remembered(layout, motion))
-    drives = trajectory_values(layout, m).T @ (layout.drive_loads * pi[layout.n_inertial :]).T
-    rate = _rate(load + drives, m)
+    rate = _rate(load + drive_torque(model, model.carried_by, m), m)
     return drive_motion(layout, m.q, m.v, m.a, signs, load, rate, begins)
 
 

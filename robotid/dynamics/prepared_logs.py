@@ -12,7 +12,7 @@ other parts.
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -135,38 +135,20 @@ _SLOWEST = 1e-3  # [m/s] speed below which speeds do not differ
 _NARROW = (0.02, 2e-3, 0.1)  # smallest deviations: force over weight, height [m], decades of speed
 
 
-@dataclass(frozen=True, eq=False)
-class FoundContact:
-    """Whether a link touches the ground, sample by sample."""
-
-    frame: str  # the link
-    touches: Array  # probability that it does, (N,)
-    force: Array  # its estimated force upwards, (N,) [N]
-
-    @property
-    def shares(self) -> tuple[float, float, float]:
-        """Shares of samples in contact, without contact, and undecided."""
-        on, off = (float(np.mean(x > _SURE)) for x in (self.touches, 1.0 - self.touches))
-        return on, off, 1.0 - on - off
-
-
 def with_contacts(model: RobotModel, log: Log, signals: SignalSettings) -> Log:
     """Return a log with all contacts of a robot; undecided samples of those found count as on."""
     flagged = [x.frame for x in model.contacts if not x.always]
     if all(frame in log.contacts for frame in flagged):
         return log
-    t, contacts = find_contacts(model, log, signals)
+    t, frames, touches, _ = find_contacts(model, log, signals)
     flags, parts = dict(log.contacts), []
-    for contact in contacts:
-        on, off, open_ = contact.shares
-        if on + off < _FEWEST:
-            raise _unknown(log, [contact.frame], f"{100 * (on + off):.0f} % of samples are decided")
-        free = np.interp(log.t, t, contact.touches, left=1.0, right=1.0) < 1.0 - _SURE
-        flags[contact.frame] = ~free
-        parts.append(
-            f"{contact.frame} {100 * on:.0f} % in contact, {100 * off:.0f} % not, "
-            f"{100 * open_:.0f} % undecided"
-        )
+    for frame, p in zip(frames, touches.T, strict=True):
+        on, off = (100.0 * float(np.mean(x > _SURE)) for x in (p, 1.0 - p))
+        if on + off < 100.0 * _FEWEST:
+            raise _unknown(log, [frame], f"{on + off:.0f} % of samples are decided")
+        flags[frame] = ~(np.interp(log.t, t, p, left=1.0, right=1.0) < 1.0 - _SURE)
+        undecided = 100.0 - on - off
+        parts.append(f"{frame} {on:.0f} % in contact, {off:.0f} % not, {undecided:.0f} % undecided")
     note = (
         f"contacts found from torques and motion: {'; '.join(parts)}. Undecided samples count as "
         "contact"
@@ -178,8 +160,11 @@ def with_contacts(model: RobotModel, log: Log, signals: SignalSettings) -> Log:
 
 def find_contacts(
     model: RobotModel, log: Log, signals: SignalSettings
-) -> tuple[Array, tuple[FoundContact, ...]]:
-    """Return times (N,) [s] and the contacts of a robot that its log does not state."""
+) -> tuple[Array, list[str], Array, Array]:
+    """Return times (N,) [s] and the contacts of a robot that its log does not state.
+
+    The k links, the probability that each touches the ground, and its force upwards [N], (N, k).
+    """
     wanted = [x for x in model.contacts if not x.always and x.frame not in log.contacts]
     if log.base is None or not log.has_torque:
         raise _unknown(log, [x.frame for x in wanted], "it has no torque or no motion of the base")
@@ -202,7 +187,7 @@ def find_contacts(
         positions = link_positions(model.pin_model, model.configurations(motion.q), frames)
         heights = positions @ _up(model)
     touches = _probabilities(force / load, heights, velocity, len(model.contacts))
-    return motion.t, tuple(map(FoundContact, frames, touches.T, force.T))
+    return motion.t, frames, touches, force
 
 
 def _up(model: RobotModel) -> Array:

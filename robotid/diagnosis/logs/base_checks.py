@@ -91,10 +91,8 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
 
 
 def _flags(model: RobotModel, log: Log, whole: Log, t: Array) -> Array:
-    """Return whether each contact of a log is in contact at times, shape (N, contacts), bool.
-
-    ``whole`` is the log with the contacts that were found.
-    """
+    """Return whether each contact of a log is in contact at times, shape (N, contacts), bool."""
+    # ``whole`` is the log with the contacts that were found.
     flags = np.ones((len(t), len(model.contacts)), dtype=bool)
     for k, contact in enumerate(model.contacts):
         if contact.is_measured:
@@ -105,11 +103,9 @@ def _flags(model: RobotModel, log: Log, whole: Log, t: Array) -> Array:
 
 
 def check_wrenches(model: RobotModel, log: str, motion: Trajectory) -> Iterator[Finding]:
-    """Yield a finding if measured forces have another sign or unit.
-
-    With the bodies of the URDF, W pi = J^T f in the rows of a floating base, less unknown forces.
-    The factor of f with the smallest residual is -1, or another unit.
-    """
+    """Yield a finding if measured forces have another sign or unit."""
+    # With the bodies of the URDF, W pi = J^T f in the rows of a floating base, less unknown forces.
+    # The factor of f with the smallest residual is -1, or another unit.
     if motion.wrenches is None or not any(x.measured for x in model.contacts):
         return
     every = max(1, len(motion.t) // _MOST)
@@ -196,10 +192,7 @@ def _loaded(contact: Contact, log: Log, t: Array) -> Array:
 
 
 def _contact_jacobian(model: RobotModel, q: Array) -> tuple[Array, Array]:
-    """Return the Jacobians (N, k, 3, n_rows) of the k points of contact, and of their links' turn.
-
-    Their axes are those of the world.
-    """
+    """Return Jacobians (N, k, 3, n_rows) of k points of contact and of their links' turn, world."""
     surfaces = tuple(Contact(contact.frame, "surface") for contact in model.contacts)
     every = np.ones((len(q), len(surfaces)), dtype=bool)
     J = constraint_jacobian(replace(model, constraints=surfaces), q, every)
@@ -211,10 +204,8 @@ def _contact_jacobian(model: RobotModel, q: Array) -> tuple[Array, Array]:
 
 
 def _radius(stated: float, v: Array, rolls: Array) -> tuple[float, float, float] | None:
-    """Return the radius of a foot in contact that rolls as a ball of another one than stated.
-
-    With it are the median speeds with the stated radius and with this one.
-    """
+    """Return the radius of a foot in contact that rolls as a ball of another one than stated."""
+    # With it are the median speeds with the stated radius and with this one.
     if not rolls.any():
         return None
     # weighted median of v / roll: the smallest sum of |v - change roll|, samples that slip apart
@@ -261,11 +252,9 @@ def check_unit(log: Log) -> Iterator[Finding]:
 
 
 def check_twist(log: Log, signals: SignalSettings) -> Iterator[Finding]:
-    """Yield a finding if the measured twist is not that of the pose, with the axes of the base.
-
-    Both pass the filter of the motion. If another reading of the quaternion explains the twist, the
-    quaternion is wrong.
-    """
+    """Yield a finding if the measured twist is not that of the pose, with the axes of the base."""
+    # Both pass the filter of the motion. If another reading of the quaternion explains the twist,
+    # the quaternion is wrong.
     base = log.base
     if base is None or base.twist is None or base.imu is not None:
         return
@@ -341,10 +330,8 @@ class _Feet:
         return R[:: self.every], np.gradient(R, self.t, axis=0)[:: self.every]
 
     def speed(self, pose: tuple[Array, Array]) -> float:
-        """Return the mean speed of the slowest contact of each sample [m/s].
-
-        Without a place of the base it is that of the slowest pair, relative to each other.
-        """
+        """Return the mean speed of the slowest contact of each sample [m/s]."""
+        # Without a place of the base it is that of the slowest pair, relative to each other.
         R, dR = pose
         v = self.x @ dR.swapaxes(1, 2) + self.dx @ R.swapaxes(1, 2)  # (n, k, 3)
         if self.dp is not None:
@@ -362,14 +349,12 @@ class _Feet:
 
 
 def check_order(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[Finding]:
-    """Yield a finding if feet on the ground hardly move with another reading of the quaternion.
-
-    The slowest foot of each sample is taken to be on the ground, whatever its flags. Tried are
-    another order of the quaternion and its inverse; the base must be above the feet. Without
-    position the feet hardly move relative to each other. A world with another vertical axis is
-    found, too: the base is above the feet along it. A tilt that is constant moves no foot, and is
-    not found: it looks like a slope.
-    """
+    """Yield a finding if feet on the ground hardly move with another reading of the quaternion."""
+    # The slowest foot of each sample is taken to be on the ground, whatever its flags. Tried are
+    # another order of the quaternion and its inverse; the base must be above the feet. Without
+    # position the feet hardly move relative to each other. A world with another vertical axis is
+    # found, too: the base is above the feet along it. A tilt that is constant moves no foot, and is
+    # not found: it looks like a slope.
     if log.base is None or not model.contacts or len(motion.t) < 3:
         return
     frames = [x.frame for x in model.contacts]
@@ -419,10 +404,8 @@ def _check_readings(log: Log, feet: _Feet, q: Array, gravity: Array) -> Iterator
 
 
 def _vertical(direction: Array, gravity: Array) -> str | None:
-    """Return the setting of gravity along the axis of a direction upwards; None without one.
-
-    The mean direction of a base that rolls over is short: it has none.
-    """
+    """Return the setting of gravity along the axis of a direction upwards; None without one."""
+    # The mean direction of a base that rolls over is short: it has none.
     k = int(np.argmax(np.abs(direction)))
     if np.abs(direction[k]) < max(_ABOVE, _ALONG * float(np.linalg.norm(direction))):
         return None
@@ -445,10 +428,8 @@ def check_imu(log: Log, motion: Trajectory) -> Iterator[Finding]:
 
 
 def _check_gyroscopes(log: Log, motion: Trajectory) -> Iterator[Finding]:
-    """Yield a finding if the angular velocity is not that of the orientation.
-
-    Another reading of the quaternion, or deg/s, may explain it.
-    """
+    """Yield a finding if the angular velocity is not that of the orientation."""
+    # Another reading of the quaternion, or deg/s, may explain it.
     w, place, quaternion = motion.v[:, 3:6], motion.q[:, :3], motion.q[:, 3:7]
 
     def off(x: Array, q: Array = quaternion) -> float:

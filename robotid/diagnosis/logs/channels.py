@@ -187,11 +187,9 @@ def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
 def _velocity_scale(
     log: Log, slope: Array, v: Array, alike: Array, velocity: str
 ) -> Iterator[Finding]:
-    """Yield measured velocities that are a multiple of d(q)/dt, or constant.
-
-    The factor lies between the slope of the regression of v on d(q)/dt and the inverse of the
-    slope of the regression of d(q)/dt on v, for any noise in the two.
-    """
+    """Yield measured velocities that are a multiple of d(q)/dt, or constant."""
+    # The factor lies between the slope of the regression of v on d(q)/dt and the inverse of the
+    # slope of the regression of d(q)/dt on v, for any noise in the two.
     slope, v = slope - slope.mean(axis=0), v - v.mean(axis=0)
     severity = {"differentiated": "note", "auto": "error" if log.has_torque else "warning"}
     for j, joint in enumerate(log.joints):
@@ -218,10 +216,8 @@ def _slopes(log: Log, velocity: Array) -> tuple[Array, Array]:
 
 
 def _amplitude(x: Array, smooth: Array, noise: float) -> float:
-    """Return the 99.5 % quantile of the distance of a channel from its median, without spikes.
-
-    Of a joint that is at rest in most of the log, only the rows in which it moves count.
-    """
+    """Return the 99.5 % quantile of the distance of a channel from its median, without spikes."""
+    # Of a joint that is at rest in most of the log, only the rows in which it moves count.
     median = np.median(x)
     away = np.abs(smooth - median)
     away = away[away > BEYOND_NOISE * noise]
@@ -369,11 +365,9 @@ def _stale_rows(log: Log, step: Array) -> Iterator[Finding]:
 
 
 def _in_motion(log: Log, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the runs of repeated rows within a motion, which continues or catches up after them.
-
-    A robot that holds a position starts again from rest, and without further channels, a single
-    step of the encoder is that of a slow motion.
-    """
+    """Return the runs of repeated rows within a motion that continues or catches up after them."""
+    # A robot that holds a position starts again from rest, and without further channels, a single
+    # step of the encoder is that of a slow motion.
     t, q, last_row = log.t, log.q, len(log.t) - 1
     first, last = np.array([run for run in runs if run[1] < last_row], dtype=int).reshape(-1, 2).T
     n = last - first + 1
@@ -429,11 +423,9 @@ def _touches(x: Array) -> int:
 
 
 def _held(log: Log) -> Iterator[Finding]:
-    """Yield the joints whose torque is updated less often than it is logged while the robot moves.
-
-    Rows that repeat in every channel are a fault of the logger and reported elsewhere; a quantised
-    torque is constant for irregular times.
-    """
+    """Yield the joints whose torque is updated less often than logged while the robot moves."""
+    # Rows that repeat in every channel are a fault of the logger and reported elsewhere; a
+    # quantised torque is constant for irregular times.
     fresh = np.append(True, (np.diff(log.q, axis=0) != 0).any(axis=1))
     lengths = np.array([_hold(x) for x in log.tau[fresh].T])
     for length in np.unique(lengths[lengths > 1]):

@@ -122,11 +122,9 @@ class _Loop:
 
     @cached_property
     def response(self) -> tuple[Array, Array, Array]:
-        """Frequency response from command to position: frequency [Hz], response, weight.
-
-        Only frequencies that the command excites are used. The weight is the inverse of the
-        relative variance, from the coherence.
-        """
+        """Frequency response from command to position: frequency [Hz], response, weight."""
+        # Only frequencies that the command excites are used. The weight is the inverse of the
+        # relative variance, from the coherence.
         from scipy.signal import csd, welch
 
         n = min(len(self.q), max(8, round(_SECONDS / self.step)))
@@ -154,11 +152,9 @@ class _Loop:
 
     @cached_property
     def lag(self) -> tuple[float, float]:
-        """Delay of the position within the bandwidth, and its standard error [s].
-
-        It is the lag of the largest correlation of their changes, plus the weighted mean of the
-        remaining phase over the frequency; nan if nothing is excited.
-        """
+        """Delay of the position within the bandwidth, and its standard error [s]."""
+        # It is the lag of the largest correlation of their changes, plus the weighted mean of the
+        # remaining phase over the frequency; nan if nothing is excited.
         f, H, weight = self.response
         first = self._first_lag()
         phase = np.angle(H * np.exp(2j * np.pi * f * first))
@@ -172,11 +168,9 @@ class _Loop:
         return first + delay, max(float(spread), float(1 / np.sqrt(np.sum(weight * w**2))))
 
     def _first_lag(self) -> float:
-        """Return the lag at which changes of position and command correlate most [s].
-
-        Of several lags with about this correlation, as for a sine, it is the shortest; nan if none
-        is positive.
-        """
+        """Return the lag at which changes of position and command correlate most [s]."""
+        # Of several lags with about this correlation, as for a sine, it is the shortest; nan if
+        # none is positive.
         from scipy.signal import correlate
 
         alike = correlate(np.diff(self.q), np.diff(self.command), method="fft")
@@ -190,11 +184,9 @@ class _Loop:
 
     @cached_property
     def delays(self) -> tuple[float, float]:
-        """The shortest and the longest pure delay that are consistent with the response [s].
-
-        H = exp(-i w T) / (g + d i w - j w^2), in which g, d and j are linear for each T; as d is
-        not negative, T is at most the lag.
-        """
+        """The shortest and the longest pure delay that are consistent with the response [s]."""
+        # H = exp(-i w T) / (g + d i w - j w^2), in which g, d and j are linear for each T; as d is
+        # not negative, T is at most the lag.
         f, H, weight = self.response
         lag, error = self.lag
         delays = _DELAYS[max(lag + 2 * error, 0.0) >= _DELAYS] if np.isfinite(lag) else _DELAYS

@@ -42,11 +42,10 @@ _FOLDED = 0.4  # largest ratio of unexplained shares at which a torque is an abs
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """The parts of the model's torque at N instants, linear in masses and gravity.
+    """The parts of the model's torque at N instants, linear in masses and gravity."""
 
-    Each part is computed at first use. Whole regressors are too large: 0.3 MB per instant for 60
-    joints.
-    """
+    # Each part is computed at first use. Whole regressors are too large: 0.3 MB per instant for 60
+    # joints.
 
     model: RobotModel
     motion: Trajectory  # The smooth motion that contains the instants
@@ -201,14 +200,12 @@ def explanations(probe: Probe) -> tuple[Explanation, Explanation, list[Explanati
 
 
 def _unsigned(probe: Probe, own: Array) -> Explanation:
-    """Return the hypothesis that torques that are never negative are absolute values.
-
-    The signs are those of the torque predicted from the signed torque, iterated from the signs of
-    the URDF's torque, of the velocity or of the acceleration. The variation of the absolute value
-    must be explained, because a constant value with the sign of the speed looks like friction. The
-    unexplained share refers to the signed torque, because the absolute value of a torque that is
-    mostly friction hardly varies.
-    """
+    """Return the hypothesis that torques that are never negative are absolute values."""
+    # The signs are those of the torque predicted from the signed torque, iterated from the signs of
+    # the URDF's torque, of the velocity or of the acceleration. The variation of the absolute value
+    # must be explained, because a constant value with the sign of the speed looks like friction.
+    # The unexplained share refers to the signed torque, because the absolute value of a torque that
+    # is mostly friction hardly varies.
     share, joints = own[:, 0].copy(), []
     loads = probe.loads()
     for j, tau in enumerate(probe.tau.T):
@@ -248,11 +245,9 @@ def _order(share: Array) -> Explanation:
 
 
 def _gravity(probe: Probe, stated: Explanation) -> Explanation:
-    """Return the direction of gravity that explains the torques best.
-
-    It is the stated one if the torques are explained, and no masses and no gravity, of any size
-    and sign, explain them better by ``HINT``.
-    """
+    """Return the direction of gravity that explains the torques best."""
+    # It is the stated one if the torques are explained, and no masses and no gravity, of any size
+    # and sign, explain them better by ``HINT``.
     from scipy.optimize import minimize
 
     size = float(np.linalg.norm(probe.gravity) or np.linalg.norm(GRAVITY))
@@ -290,11 +285,10 @@ def _gravity(probe: Probe, stated: Explanation) -> Explanation:
 
 
 def _shares_by_gravity(probe: Probe) -> tuple[Callable[[Array], Array], Array]:
-    """Return a function of gravity (3,): the unexplained share of each torque, (n,).
-
-    Loads are linear in gravity, so one triangular factor per joint is used for all of them. Second,
-    the shares that all their columns leave, with factors of any sign, (n,): no gravity leaves less.
-    """
+    """Return a function of gravity (3,): the unexplained share of each torque, (n,)."""
+    # Loads are linear in gravity, so one triangular factor per joint is used for all of them.
+    # Second, the shares that all their columns leave, with factors of any sign, (n,): no gravity
+    # leaves less.
     links, size = probe.loads(), _variation(probe.tau)
     X = [links, *probe.gravity_loads, probe.drives, probe.tau[:, :, None]]
     rows = np.concatenate(X, axis=2).swapaxes(0, 1)
@@ -313,11 +307,9 @@ def _shares_by_gravity(probe: Probe) -> tuple[Callable[[Array], Array], Array]:
 
 
 def _positions(probe: Probe, best: float) -> Iterator[Explanation]:
-    """Yield readings with another position column, sign or zero, if one is clearly better.
-
-    They are tested with few rows, first with a quarter of them: a reading without half of the
-    required decrease there is not tested further.
-    """
+    """Yield readings with another position column, sign or zero, if one is clearly better."""
+    # They are tested with few rows, first with a quarter of them: a reading without half of the
+    # required decrease there is not tested further.
     every = max(1, len(probe.rows) // _ROWS)
     some, few = (
         Probe.of(probe.model, probe.motion, probe.rows[::k]) for k in (every, _QUARTER * every)
@@ -347,10 +339,8 @@ def _revolute(probe: Probe) -> list[int]:
 
 
 def _exchanged(probe: Probe, pair: tuple[int, int]) -> list[Explanation]:
-    """Return the readings that the position columns, or all columns, of two joints are exchanged.
-
-    Each joint is tested with its own torque, and with the torque of the other joint.
-    """
+    """Return the readings that the positions, or all columns, of two joints are exchanged."""
+    # Each joint is tested with its own torque, and with the torque of the other joint.
     order = np.arange(len(probe.model.joints))
     order[list(pair)] = pair[::-1]
     moved = replace(probe, q=probe.q[:, order], v=probe.v[:, order], a=probe.a[:, order])

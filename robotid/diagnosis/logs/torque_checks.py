@@ -77,11 +77,9 @@ class _Reading:
 
 
 def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
-    """Yield the faults of signs, columns, gravity or URDF that keep the torques from fitting.
-
-    Only the reading that explains the torques best is reported; if it is the stated one, the
-    URDF's masses are checked.
-    """
+    """Yield the faults of signs, columns, gravity or URDF that keep the torques from fitting."""
+    # Only the reading that explains the torques best is reported; if it is the stated one, the
+    # URDF's masses are checked.
     stated, loaded, others = explanations(probe)
     best = min(others, key=lambda e: e.misfit)
     if best.kind not in ("torque_sign", "unsigned_torque") and loaded.misfit < best.misfit:
@@ -188,10 +186,9 @@ def _unexplained(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
 
 @dataclass(frozen=True, eq=False)
 class LoadModel:
-    """The whitened torques of each joint, projected orthogonally to the columns of its drive.
+    """The whitened torques of each joint, projected orthogonally to the columns of its drive."""
 
-    The c free parameters are factors of the URDF's links, and m, mcx, mcy, mcz of a payload.
-    """
+    # The c free parameters are factors of the URDF's links, and m, mcx, mcy, mcz of a payload.
 
     R: Array  # (n, c+1, c+1), triangular factors of columns and torque; 0 of joints not used
     mean: Array  # (c,), prior mean
@@ -259,11 +256,9 @@ def load_model(probe: Probe, share: Array, level: Array | None = None) -> LoadMo
 
 
 def _check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
-    """Yield torques in another scale, a payload, a URDF of another robot.
-
-    Another scale is accepted if the torques then fit with about the URDF's masses; else the URDF
-    is of another robot.
-    """
+    """Yield torques in another scale, a payload, a URDF of another robot."""
+    # Another scale is accepted if the torques then fit with about the URDF's masses; else the URDF
+    # is of another robot.
     model, ones = load_model(probe, share), np.ones(len(share))
     bodies = len(probe.model.layout.bodies)
     _, theta, error = model.fit(ones)
@@ -285,10 +280,8 @@ def _check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
 
 
 def _holds_no_gravity(probe: Probe) -> bool:
-    """Return whether the torques fit the URDF if its gravity is added, and not as logged.
-
-    Both tests use the level of the logged torques, and no load on the last link.
-    """
+    """Return whether the torques fit the URDF if its gravity is added, and not as logged."""
+    # Both tests use the level of the logged torques, and no load on the last link.
     if not probe.gravity.any() or _holds_gravity(probe):
         return False
     readings, ones = [(probe, own_share(probe)), compensated(probe)], np.ones(probe.tau.shape[1])
@@ -400,12 +393,10 @@ def check_payload_change(
     model: RobotModel, mapping: BaseMapping, fitted: Sequence[Reduction],
     validation: Sequence[Reduction], independent: float, name: str,
 ) -> Iterator[Finding]:  # fmt: skip
-    """Yield a warning "payload_change" if a validation log has another load than the fitted ones.
-
-    Both are fitted together, with free parameters of all links and a load in the last link of the
-    validation log only. The load is reported if the same robot with it fits both. ``independent``
-    is the number of independent samples.
-    """
+    """Yield a warning if a validation log has another load than the fitted ones."""
+    # Both are fitted together, with free parameters of all links and a load in the last link of the
+    # validation log only. The load is reported if the same robot with it fits both. ``independent``
+    # is the number of independent samples.
     layout, every = model.layout, (*fitted, *validation)
     squares, samples = sum(r.squares for r in every), sum(r.samples for r in every)
     size = payload_spread(model)

@@ -47,10 +47,9 @@ _EXACT = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class _Misfit:
-    """The unexplained part of each torque at each delay of the grid.
+    """The unexplained part of each torque at each delay of the grid."""
 
-    The parts are sums of squares in each block of the log, as shares of the joint's torque.
-    """
+    # The parts are sums of squares in each block of the log, as shares of the joint's torque.
 
     squares: Array  # (n, blocks, delays)
     loaded: Array  # the same if friction also grows with the load
@@ -117,15 +116,13 @@ class _Window:
 def check_torque_delay(
     model: RobotModel, log: Log, signals: SignalSettings, name: str
 ) -> Iterator[Finding]:
-    """Yield the delay of the torque relative to the position: "torque_delay", at most once.
-
-    The delay minimises the unexplained part of the delayed torque. The model has, besides the
-    inertias, friction as an antisymmetric function of the speed, and a torque that is periodic in
-    the position. Instants near slow ones are not used. The standard error is the jackknife's over
-    the joints and over blocks of the log. The finding is a warning from three standard errors, if
-    the delay of the other blocks explains each block better. A delay of more than 40 ms must
-    explain at least 15 % of the unexplained torque.
-    """
+    """Yield the delay of the torque relative to the position: "torque_delay", at most once."""
+    # The delay minimises the unexplained part of the delayed torque. The model has, besides the
+    # inertias, friction as an antisymmetric function of the speed, and a torque that is periodic in
+    # the position. Instants near slow ones are not used. The standard error is the jackknife's over
+    # the joints and over blocks of the log. The finding is a warning from three standard errors, if
+    # the delay of the other blocks explains each block better. A delay of more than 40 ms must
+    # explain at least 15 % of the unexplained torque.
     step = float(np.median(np.diff(log.t)))
     rate = min(1 / step, signals.rate or np.inf)
     # the comparison is filtered even if the job has no filter: see _BAND
@@ -247,11 +244,9 @@ def _interpolated(t: Array, values: Array, times: Array) -> Array:
 
 
 def _squares(window: _Window, j: int, own: slice) -> tuple[Array, Array, int] | None:
-    """Return the unexplained part of joint j's torque, and its instants.
-
-    Its inertial columns are ``own``. The parts have shape (blocks, delays); in the second one
-    friction grows with the load, too. None for a joint that moves in too few instants.
-    """
+    """Return the unexplained part of joint j's torque, and its instants."""
+    # Its inertial columns are ``own``. The parts have shape (blocks, delays); in the second one
+    # friction grows with the load, too. None for a joint that moves in too few instants.
     at = window.steady[:, j]
     used = int(np.count_nonzero(at))
     if used < max(_FEW, MOVING * len(at)):

@@ -186,11 +186,9 @@ class _Options:
         return self.trials.held_out.left(self._columns(chosen))
 
     def left_each(self, chosen: Sequence[int]) -> dict[int, Array]:
-        """Return the squared residual of each segment with those chosen and each other candidate.
-
-        Only of candidates with physical parameters: friction opposes motion and is below the
-        largest torque of the joint. A joint has one family of each kind.
-        """
+        """Return the squared residual of each segment with those chosen and another candidate."""
+        # Only of candidates with physical parameters: friction opposes motion and is below the
+        # largest torque of the joint. A joint has one family of each kind.
         kinds = {_kind(self.name(k)) for k in chosen}
         other = [i for i in range(len(self.own)) if _kind(self.name(i)) not in kinds]
         columns = {i: self._columns([*chosen, i]) for i in other}
@@ -213,10 +211,8 @@ def _kind(name: str) -> str:
 
 
 def _amplitude(drive: _Drive, term: DriveTerm) -> float:
-    """Return the largest value of a curve of velocity; next to 0 for another term.
-
-    At low speed the filter reduces the sign of the velocity and hides the amplitude of the curve.
-    """
+    """Return the largest value of a curve of velocity; next to 0 for another term."""
+    # At low speed the filter reduces the sign of the velocity and hides the amplitude of the curve.
     if term.guards != "v" or not isinstance(term, MemorylessTerm):
         return decisions.NOTHING
     v = np.linspace(*drive.data_range["v"], 50)
@@ -270,13 +266,11 @@ def _conditioned(
     sample: Sample, drive: _Drive, every: _Options, this: Round[int], chosen: Sequence[int],
     best: int,
 ) -> _Refined:  # fmt: skip
-    """Return the best candidate, or an equally good and better conditioned one of another family.
+    """Return the best candidate, or an equally good, better conditioned one of another family."""
 
-    Equally good: its residual of held-out segments is not larger than that of the best, within the
-    standard error of the difference. Better conditioned: no shape is at its bound, or no term
-    increases the standard error of another parameter of the drive tenfold, unlike the best.
-    """
-
+    # Equally good: its residual of held-out segments is not larger than that of the best, within
+    # the standard error of the difference. Better conditioned: no shape is at its bound, or no term
+    # increases the standard error of another parameter of the drive tenfold, unlike the best.
     def refined(i: int) -> _Refined:
         own = _refined(sample, drive, [every.own[k] for k in (*chosen, i)])
         weighted = _reweighted(sample, drive, own)
@@ -403,11 +397,10 @@ def _at_bound(drive: _Drive, chosen: Sequence[_Sized]) -> Array:
 
 
 def _grown(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> dict[str, float]:
-    """Return the factor by which terms increase the standard error of each plain parameter.
-
-    With X the columns of terms and shapes, M = 1 - W (W^T W + 1)^-1 W^T and T = (W^T W + 1)^-1 W^T
-    X, the covariance (W^T W + 1)^-1 of the base parameters becomes that plus T (X^T M X)^-1 T^T.
-    """
+    """Return the factor by which terms increase the standard error of each plain parameter."""
+    # With X the columns of terms and shapes, M = 1 - W (W^T W + 1)^-1 W^T and T = (W^T W + 1)^-1
+    # W^T X, the covariance (W^T W + 1)^-1 of the base parameters becomes that plus T (X^T M X)^-1
+    # T^T.
     if not chosen:
         return {}
     _, trial = _with_slopes(sample, drive, chosen)
@@ -422,11 +415,9 @@ def _grown(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> dict[str,
 
 
 def _reweighted(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> Sample:
-    """Return the samples with the joint's weights from its residual with the new terms.
-
-    With the residual without them the weights of this joint would be far too small, compared with
-    those of other joints and with the prior.
-    """
+    """Return the samples with the joint's weights from its residual with the new terms."""
+    # With the residual without them the weights of this joint would be far too small, compared with
+    # those of other joints and with the prior.
     if not chosen:
         return sample
     terms = _terms(drive, chosen)

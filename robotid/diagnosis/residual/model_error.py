@@ -73,10 +73,8 @@ def _wider(fit: Fit, sample: Sample, moved: Sequence[_Move]) -> Fit:
 
 
 def _of_shapes(fit: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> Iterator[_Move]:
-    """Yield the uncertain directions of shapes.
-
-    The errors of a joint's shapes are correlated: C_s = L L^T, one direction per column of L.
-    """
+    """Yield the uncertain directions of shapes."""
+    # The errors of a joint's shapes are correlated: C_s = L L^T, one direction per column of L.
     for choice in fit.drives:
         if choice.shapes:
             T = _shape_trial(fit, choice, sample, motions).T[:, :-1]
@@ -112,10 +110,8 @@ def _shape_trial(
 
 
 def settled_shapes(fit: Solution) -> tuple[DriveChoice, ...] | None:
-    """Return choices with shapes refitted now that all joints have their terms.
-
-    One Gauss-Newton step: the step of a shape is the parameter of its column.
-    """
+    """Return choices with shapes refitted now that all joints have their terms."""
+    # One Gauss-Newton step: the step of a shape is the parameter of its column.
     sample = take_sample(fit, for_drives=True)
     if sample is None or not any(choice.shapes for choice in fit.drives):
         return None

@@ -183,11 +183,9 @@ def _carrying(tree: Tree) -> set[str]:
 
 
 def audit_links(model: RobotModel) -> Iterator[Finding]:
-    """Yield implausible inertials of a robot.
-
-    A body is a moving link with all links that are fixed to it. The collision geometry is used,
-    or the visual one; a body whose geometry cannot be read is not checked.
-    """
+    """Yield implausible inertials of a robot."""
+    # A body is a moving link with all links that are fixed to it. The collision geometry is used,
+    # or the visual one; a body whose geometry cannot be read is not checked.
     yield from _templates(model)
     points = body_points(model)
     yield from audit_bodies(model, model.standard_parameters(), points)
@@ -199,10 +197,8 @@ def audit_links(model: RobotModel) -> Iterator[Finding]:
 
 
 def audit_bodies(model: RobotModel, pi: Array, points: Mapping[str, Array]) -> Iterator[Finding]:
-    """Yield the bodies whose parameters are impossible in the box around their geometry.
-
-    A body without geometry is compared with the length that the kinematics give it.
-    """
+    """Yield the bodies whose parameters are impossible in the box around their geometry."""
+    # A body without geometry is compared with the length that the kinematics give it.
     J = pseudo_inertia(pi[: model.layout.n_inertial])
     lengths = kinematic_lengths(model) if set(model.layout.bodies) - points.keys() else {}
     parents = [i for i in model.pin_model.parents if i > 0] if lengths else []
@@ -259,11 +255,9 @@ def _against_geometry(body: str, J: Array, points: Array) -> Iterator[Finding]:
 
 
 def _against_kinematics(body: str, J: Array, length: float, longest: float) -> Iterator[Finding]:
-    """Yield the parameters of a body without geometry that are impossible for its length [m].
-
-    A body may be wide where its joints are close: warnings need more than the longest of all bodies
-    allows.
-    """
+    """Yield the parameters of a body without geometry that are impossible for its length [m]."""
+    # A body may be wide where its joints are close: warnings need more than the longest of all
+    # bodies allows.
     of_link, centre = {"subject": f"link {body}", "link": body}, J[:3, 3] / J[3, 3]
     distance = float(np.linalg.norm(centre))
     if distance > max(length, longest):

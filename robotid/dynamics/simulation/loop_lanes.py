@@ -141,53 +141,31 @@ class Places(NamedTuple):
     middle: int  # position at that instant
     h: int  # torque of gravity and speeds
     a: int  # acceleration
-    M: int  # mass matrix of the bodies, (n, n)
     G: int  # residual of the step's equation, then the correction of u
-    H: int  # derivative of G by u, then its factor, (n, n)
     by_q: int  # derivative of friction by the position
     gains: int  # 1 for a loop below its torque limit, else 0
     load: int  # torque of the bodies
     loss: int  # factor of the load in a gear with friction
+    own: int  # derivative of the equation by one parameter
+    change: int  # of u by one parameter
     held: int  # torque until the next tick; -1 in continuous time
     grip: int  # friction of bristles, then its derivative by the speed
-    bristles: int  # of each: z, the acting z, and three derivatives
+    M: int  # mass matrix of the bodies, (n, n)
+    H: int  # derivative of G by u, then its factor, (n, n)
     T_q: int  # derivative of the equation by positions before the step, (n, n)
     T_v: int  # and by speeds, (n, n)
     S: int  # sensitivities of positions and speeds, (2n, P)
-    own: int  # derivative of the equation by one parameter
-    change: int  # of u by one parameter
     by_hold: int  # sensitivities of the held torques, (n, P)
+    bristles: int  # of each: z, the acting z, and three derivatives
     by_state: int  # sensitivities of the bristles, (bristles, P)
+    end: int
 
 
-@compiled
-def _places(n, P, n_bristles, is_held):
-    q = (n + 1) * BODY
-    M = q + 13 * n
-    S = M + 4 * n * n
-    held = S + 3 * n * P
-    grip = held + n
-    bristles = grip + 2 * n
-    return Places(
-        n, P, q, q + n, q + 2 * n, q + 3 * n, q + 4 * n, q + 5 * n,
-        M, q + 6 * n, M + n * n, q + 7 * n, q + 8 * n, q + 11 * n, q + 12 * n,
-        held if is_held else -1, grip, bristles,
-        M + 2 * n * n, M + 3 * n * n, S, q + 9 * n, q + 10 * n,
-        S + 2 * n * P, bristles + 5 * n_bristles,
-    )  # fmt: skip
-
-
-def work_of(joints: int, columns: int, n_bristles: int) -> Array:
-    """Return a new work space for ``_places``."""
-    n = joints
-    own = (n + 1) * BODY + 4 * n * n + 16 * n + 3 * n * columns
-    return work_space(own + n_bristles * (5 + columns))
-
-
-def last_step(work: Array, joints: int) -> tuple[Array, Array]:
-    """Return the positions before the last step and its last correction of speeds, (n, LANES)."""
-    rows, q = work.reshape(-1, LANES), (joints + 1) * BODY
-    return rows[q : q + joints], rows[q + 6 * joints : q + 7 * joints]
+def places_of(n: int, P: int, n_bristles: int, is_held: bool) -> tuple[Places, Array]:
+    """Return the places of the quantities, one after the other, and a new work space of them."""
+    sizes = [n] * 14 + [2 * n] + [n * n] * 4 + [2 * n * P, n * P, 5 * n_bristles, n_bristles * P]
+    at = Places(n, P, *np.cumsum([(n + 1) * BODY, *sizes]).tolist())
+    return at if is_held else at._replace(held=-1), work_space(at.end)
 
 
 @compiled
@@ -518,15 +496,13 @@ def _initialise(work, at, robot, columns, start, out_S):
 
 
 @compiled
-def roll_out(robot, columns, course, out, work, corrects):
+def roll_out(robot, columns, course, out, work, at, corrects):
     """Simulate a block of lanes; return the first step without a solution, or -1."""
     command, steps, ticks, every, start = course
     out_q, out_v = out.q.reshape(out.q.size), out.v.reshape(out.v.size)
     out_S, rows = out.S.reshape(out.S.size), out.S.shape[1]
     tree, bodies, terms = robot.tree, robot.bodies, robot.terms
-    n, P = len(tree.parents), len(columns.sums) - 1
-    at = _places(n, P, len(terms.bristles), len(ticks) > 0)
-    work[:] = 0.0
+    n, P = at.n, at.P
     _initialise(work, at, robot, columns, start, out.S)
     commands, starts = command.reshape(command.size), ticks.reshape(ticks.size)
     lengths = steps.reshape(steps.size)

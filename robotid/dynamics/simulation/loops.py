@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import islice, pairwise
+from itertools import chain, islice, pairwise
 from types import ModuleType
 from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeAlias
 
@@ -27,7 +27,7 @@ from robotid.robot.mass_matrix import rigid_mass_matrices
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
-    from robotid.dynamics.simulation.loop_lanes import Course
+    from robotid.dynamics.simulation.loop_lanes import Course, Terms
 
 #: Kind, joint and index of a parameter of the sensitivities; see ``loop_lanes``.
 Column: TypeAlias = tuple[int, int, int]
@@ -251,34 +251,27 @@ class ClosedLoopRobot:
         sums = np.append(first, len(columns)).astype(np.int64)
         columns = np.ascontiguousarray(columns[:, :3])
         columns[:, 1] = [np.flatnonzero(own == j)[0] for j in columns[:, 1]]
-        places, spans, affine = _arranged(loops, own)
+        places, terms, affine = _arranged(loops, own)
         is_term = columns[:, 0] == self.kinds["term"]
         columns[is_term, 2] = [np.flatnonzero(places == k)[0] for k in columns[is_term, 2]]
-        every_term = [(term, j) for j, terms in enumerate(loops.terms) for term in terms]
-        coded = [lanes.coded_term(every_term[k][0]) for k in places]
-        codes = np.array([code for code, _ in coded], dtype=np.int64).reshape(-1, 5)
-        shapes = np.array([numbers for _, numbers in coded]).reshape(-1, 11)
-        of_joint = np.array([np.flatnonzero(own == every_term[k][1])[0] for k in places], dtype=int)
-        states = np.flatnonzero(codes[:, 2] == BRISTLES)
-        bristles = np.column_stack([states, of_joint[states]])
-        terms = lanes.Terms(codes, shapes, loops.values[places], spans, bristles)
-        drives = np.column_stack(
-            [x[own] for x in (loops.armature, loops.kp, loops.kd, loops.limit)] + [affine]
-        )
+        gains = [x[own] for x in (loops.armature, loops.kp, loops.kd, loops.limit)]
+        drives = np.column_stack([*gains, affine])
         robot = lanes.Robot(part.tree, loops.zero[own], loops.bodies[part.bodies], drives, terms)
         course = self._course(part, windows, loops)
         samples = len(course.steps) // course.every + 1
         q, v = np.zeros((2, samples, n, lanes.LANES))
         S = np.zeros((samples, outputs * n, len(numbers), lanes.LANES))
         q[0], v[0] = course.start
-        work = lanes.work_of(n, len(numbers), len(states))
+        is_held = loops.rate is not None
+        at, work = lanes.places_of(n, len(numbers), len(terms.bristles), is_held)
         kinds, motion = lanes.Columns(columns, sums, along), lanes.Motion(q, v, S)
-        failed = lanes.roll_out(robot, kinds, course, motion, work, self.corrects)
+        failed = lanes.roll_out(robot, kinds, course, motion, work, at, self.corrects)
         if failed >= 0 or not (np.abs(v) < _FASTEST).all():
-            last = lanes.last_step(work, n) if failed >= 0 else None
-            at, lane, i, angles = _failed_at(failed // course.every, last, q, v)
+            rows = work.reshape(-1, lanes.LANES)
+            last = (rows[at.q : at.q + n], rows[at.G : at.G + n]) if failed >= 0 else None
+            row, lane, i, angles = _failed_at(failed // course.every, last, q, v)
             window = windows[lane]
-            time = float(window.log.t[min(window.start_row + at, window.stop - 1)])
+            time = float(window.log.t[min(window.start_row + row, window.stop - 1)])
             why = why_no_solution(self.model, loops, own, angles, i, self.step)
             raise NotConvergedError(why, f"{window.log.name} at {time:.4g} s")
         return numbers, q, v, S
@@ -372,13 +365,12 @@ def _parts(tree: Tree) -> list[_Part]:
     return [_Part(tree.leaders[own], own, tree.part(own)) for own in bodies]
 
 
-def _arranged(loops: Loops, joints: Array) -> tuple[Array, Array, Array]:
-    """Return the indices in ``loops.values`` of the terms of joints, joint by joint.
+def _arranged(loops: Loops, joints: Array) -> tuple[Array, "Terms", Array]:
+    """Return the indices in ``loops.values`` of the terms of joints, joint by joint, and the terms.
 
-    Also, for each joint, the index of its first term, and of its first bristle or affine term,
-    (n, 2); and the sums of its affine terms: constant, by the speed, by its direction, (n, 3).
+    Also, for each joint, the sums of its affine terms: constant, by the speed, by its direction.
     """
-    first = np.cumsum([0, *map(len, loops.terms)])
+    lanes, first = _lanes(), np.cumsum([0, *map(len, loops.terms)])
     places, spans, affine = list[int](), [], np.zeros((len(joints), 3))
     for i, j in enumerate(joints):
         others, rest = list[int](), list[int]()
@@ -390,7 +382,15 @@ def _arranged(loops: Loops, joints: Array) -> tuple[Array, Array, Array]:
                 (rest if isinstance(term, Bristles) else others).append(k)
         spans.append([len(places), len(places) + len(others)])
         places += [*others, *rest]
-    return np.array(places, dtype=int), np.array(spans, dtype=np.int64), affine
+    terms = list(chain.from_iterable(loops.terms))
+    coded = [lanes.coded_term(terms[k]) for k in places]
+    codes = np.array([code for code, _ in coded], dtype=np.int64).reshape(-1, 5)
+    shapes = np.array([numbers for _, numbers in coded]).reshape(-1, 11)
+    states = np.flatnonzero(codes[:, 2] == BRISTLES)
+    of_joint = np.searchsorted([start for start, _ in spans], states, side="right") - 1
+    order, edges = np.array(places, dtype=int), np.array(spans, dtype=np.int64)
+    bristles = np.column_stack([states, of_joint])
+    return order, lanes.Terms(codes, shapes, loops.values[order], edges, bristles), affine
 
 
 def _lanes() -> ModuleType:

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -62,7 +61,7 @@ from robotid.estimation.variation.groups import (
     with_zeros,
 )
 from robotid.robot.bodies import held_parameters, negligible_bodies
-from robotid.robot.geometry import body_boxes, geometry_half_spaces
+from robotid.robot.geometry import body_boxes
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
@@ -132,7 +131,6 @@ def make_estimator(
 def consistent_fit(choice: BoundedSettings, known: Known) -> Consistent:
     """Return the physically consistent estimator, which can also project an estimate."""
     bounds, stated, model = choice.bounds, choice.prior_weight, known.model
-    geometry = geometry_half_spaces(model, bounds.com_within)
     extent = body_boxes(model) if bounds.extent == "box" else {}
     bounds = replace(bounds, pinned=pinned_links(bounds, model))
     fit = Consistent(
@@ -143,7 +141,7 @@ def consistent_fit(choice: BoundedSettings, known: Known) -> Consistent:
         held=held_parameters(model),
         prior_weight=1.0 if isinstance(stated, str) else stated,
         independent_share=known.share,
-        constraints=make_constraints(bounds, geometry, extent),
+        constraints=make_constraints(bounds, extent),
         wls_noise=known.sigma,
     )
     folds = gather(known.held_out, _FOLDS)
@@ -173,14 +171,9 @@ def pinned_links(bounds: ConstraintSettings, model: RobotModel) -> tuple[str, ..
     return (*bounds.pinned, *(x for x in negligible_bodies(model) if x not in bounded))
 
 
-def make_constraints(
-    bounds: ConstraintSettings,
-    geometry: Mapping[str, tuple[Array, Array]],
-    extent: Mapping[str, Array] = MappingProxyType({}),
-) -> Constraints:
+def make_constraints(bounds: ConstraintSettings, extent: Mapping[str, Array]) -> Constraints:
     """Return the constraints in the form that the estimator needs."""
-    A = np.vstack([np.eye(3), -np.eye(3)])
-    com, extents = dict(geometry), dict(extent)
+    A, com, extents = np.vstack([np.eye(3), -np.eye(3)]), {}, dict(extent)
     for name, (low, high) in bounds.boxes.items():
         com[name] = (A, np.concatenate([high, np.negative(low)]))
         if name in extents:  # a stated box enlarges the box of the geometry

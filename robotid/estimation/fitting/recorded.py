@@ -35,7 +35,13 @@ from robotid.data.signals import (
 from robotid.data.units import check_reach, check_units
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.constraint_rows import constrained, logged_base
-from robotid.dynamics.factors import Factors, Reduction, compress_segments, join_segments
+from robotid.dynamics.factors import (
+    Factors,
+    Reduction,
+    compress,
+    compress_segments,
+    join_segments,
+)
 from robotid.dynamics.prediction import is_loaded, remember
 from robotid.dynamics.prepared_logs import (
     base_problem,
@@ -144,10 +150,9 @@ class LogPiece:
 def reduce_piece(piece: LogPiece, threads: int | None = None, *, mapping: BaseMapping) -> Reduction:
     """Return the factors of a piece in base parameters; of no samples if none are usable."""
     rows = piece.read()
-    problem = base_problem(
-        piece.model, mapping, rows.trajectory, rows.mask, compiled=piece.is_compiled
-    )
-    return Reduction.of(problem, rows.trajectory, threads=threads)
+    motion = rows.trajectory
+    problem = base_problem(piece.model, mapping, motion, rows.mask, compiled=piece.is_compiled)
+    return Reduction(compress(problem, threads=threads), motion.squares, len(motion.t))
 
 
 @dataclass(frozen=True, eq=False)
@@ -624,4 +629,4 @@ class Recordings:
 
     def _whole(self, k: int, motion: Trajectory) -> Iterator[Reduction]:
         """Yield the reduction of a log in memory."""
-        yield Reduction.of(self.problem_of(k, motion), motion)
+        yield Reduction(compress(self.problem_of(k, motion)), motion.squares, len(motion.t))
