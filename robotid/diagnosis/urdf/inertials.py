@@ -17,8 +17,7 @@ from robotid.robot.geometry import body_points, kinematic_lengths
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.prior import REASONS, assumed_masses
-from robotid.robot.tree import Inertial, Joint, Tree
-from robotid.robot.urdf_text import exact_angle, numbers
+from robotid.robot.tree import Inertial, Joint, Tree, exact_angle, numbers
 
 #: Findings that take the URDF's masses as evidence.
 _OF_MASSES = (
