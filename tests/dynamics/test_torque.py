@@ -6,7 +6,7 @@ from robotid.base.exceptions import DataError
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import Transmission
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.problem import Sample, shuffled
+from robotid.dynamics.factors import Sample, shuffled
 from robotid.dynamics.torque import (
     InstantRegressor,
     build_problem,
