@@ -110,15 +110,11 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
         return replace(recordings, repeated=errors)
     bias = biases[0] + fit.known[c:]
     error = float(np.sqrt(np.mean(np.diag(fit.covariance)[c:])))
-    return _without_bias(recordings, replace(errors, bias=bias, bias_error=error), bias)
-
-
-def _without_bias(recordings: Recordings, errors: RepeatedErrors, bias: Array) -> Recordings:
-    """Return recordings with their errors, without the bias (3,) of accelerometers [m/s^2]."""
     fitted, validation = (
         [log.with_accelerometer_bias(bias) for log in logs]
         for logs in (recordings.fitted, recordings.validation)
     )
+    errors = replace(errors, bias=bias, bias_error=error)
     return replace(recordings, repeated=errors, fitted=fitted, validation=validation)
 
 
