@@ -14,19 +14,18 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from robotid.base.exceptions import MissingDependencyError, SettingsError
+from robotid.base.exceptions import MissingDependencyError
 from robotid.base.typing import Array
 from robotid.robot.bodies import link_places
 from robotid.robot.examples import example_urdfs
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
-from robotid.robot.urdf_text import LARGEST, numbers
+from robotid.robot.tree import LARGEST, numbers
 
 _FORMATS = (".stl", ".dae", ".obj", ".ply", ".off", ".glb", ".gltf")
 _MOST_BYTES = 2**28  # of a mesh; that of a link has about 2**20
 
 _SIDES = 16  # of the prism around a cylinder
-_MOST_FACES = 100  # a hull with more is replaced by an outer polytope with this many faces
 _GROWN = 0.05  # enlargement on each side of the box of a body's geometry, over its diagonal
 _GROWN_BLIND = 0.35  # the same of the box of its frames only, which have no width
 #: Share of the robot's length that a body extends at least beyond its frames, on each side.
@@ -96,31 +95,27 @@ def find_mesh(name: str, urdf: str | Path) -> Path | None:
 
 def read_surfaces(path: Path) -> tuple[Surface, ...]:
     """Read a mesh: STL, DAE, OBJ, PLY, OFF or glTF."""
-    if path.suffix.lower() not in _FORMATS:
-        raise ValueError(f"{path.name} is not a mesh, wanted {', '.join(_FORMATS)}")
-    try:
-        return _read_surfaces(path)
-    except Exception as error:  # the readers of the formats raise errors of every kind
-        raise ValueError(f"{path.name} cannot be read: {error}") from error
-
-
-def _read_surfaces(path: Path) -> tuple[Surface, ...]:
     import trimesh
 
-    if path.stat().st_size > _MOST_BYTES:
-        raise ValueError(f"the file has more than {_MOST_BYTES // 2**20} MiB")
-    scene = trimesh.load_scene(path)
-    metres = 1.0
-    if path.suffix.lower() == ".dae":  # the one format that states its unit
-        metres = float(trimesh.units.unit_conversion(scene.units or "meters", "meters"))
+    if path.suffix.lower() not in _FORMATS:
+        raise ValueError(f"{path.name} is not a mesh, wanted {', '.join(_FORMATS)}")
     by_colour: dict[tuple[float, ...] | None, list[Surface]] = {}
-    for mesh in scene.dump():
-        if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
-            rgba = _mesh_colour(mesh.visual)
-            surface = Surface(metres * np.asarray(mesh.vertices), np.asarray(mesh.faces), rgba)
-            if not np.abs(surface.vertices).max(initial=0.0) <= LARGEST:
-                raise ValueError(f"a corner is not finite, or beyond {LARGEST:g} m")
-            by_colour.setdefault(rgba, []).append(surface)
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise ValueError(f"the file has more than {_MOST_BYTES // 2**20} MiB")
+        scene = trimesh.load_scene(path)
+        metres = 1.0
+        if path.suffix.lower() == ".dae":  # the one format that states its unit
+            metres = float(trimesh.units.unit_conversion(scene.units or "meters", "meters"))
+        for mesh in scene.dump():
+            if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
+                rgba = _mesh_colour(mesh.visual)
+                surface = Surface(metres * np.asarray(mesh.vertices), np.asarray(mesh.faces), rgba)
+                if not np.abs(surface.vertices).max(initial=0.0) <= LARGEST:
+                    raise ValueError(f"a corner is not finite, or beyond {LARGEST:g} m")
+                by_colour.setdefault(rgba, []).append(surface)
+    except Exception as error:  # the readers of the formats raise errors of every kind
+        raise ValueError(f"{path.name} cannot be read: {error}") from error
     return tuple(joined(surfaces) for surfaces in by_colour.values())
 
 
@@ -187,24 +182,10 @@ def _mesh_colour(visual: Any) -> tuple[float, ...] | None:  # noqa: ANN401
 
 def joined(surfaces: Sequence[Surface]) -> Surface:
     """Return surfaces as one, of the first one's colour."""
-    starts = np.cumsum([0, *(len(s.vertices) for s in surfaces[:-1])])
-    faces = [s.faces + start for s, start in zip(surfaces, starts, strict=True)]
-    vertices = np.vstack([s.vertices for s in surfaces])
-    return Surface(vertices, np.vstack(faces), surfaces[0].rgba)
+    from trimesh.util import append_faces
 
-
-def geometry_half_spaces(model: RobotModel, shape: str) -> dict[str, tuple[Array, Array]]:
-    """Return bounds on the centres of mass from the URDF's geometry."""
-    if shape == "none":
-        return {}
-    points = body_points(model)
-    if not points:
-        raise SettingsError(
-            f"com_within is {shape!r}, but no link has readable geometry in "
-            f"{Path(model.tree.path).name}; state boxes with 'com', or omit com_within"
-        )
-    around = box_half_spaces if shape == "box" else hull_half_spaces
-    return {body: around(cloud) for body, cloud in points.items()}
+    vertices, faces = append_faces([s.vertices for s in surfaces], [s.faces for s in surfaces])
+    return Surface(vertices, faces, surfaces[0].rgba)
 
 
 def body_points(model: RobotModel, *, with_visual: bool = False) -> dict[str, Array]:
@@ -289,30 +270,6 @@ def kinematic_lengths(model: RobotModel) -> dict[str, float]:
         if 0 < length < np.inf:
             lengths[body] = length
     return lengths
-
-
-def box_half_spaces(points: Array) -> tuple[Array, Array]:
-    """Return the axis-parallel box around points: A c <= b, A of shape (6, 3), b of (6,) [m]."""
-    A = np.vstack([np.eye(3), -np.eye(3)])
-    return A, (A @ points.T).max(axis=1)
-
-
-def hull_half_spaces(points: Array) -> tuple[Array, Array]:
-    """Return the convex hull of points as half-spaces A c <= b: -> (f, 3), (f,) [m]."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    try:
-        planes = ConvexHull(points).equations  # n^T x + o <= 0
-    except QhullError:  # all points in one plane
-        return box_half_spaces(points)
-    planes = planes[np.unique(np.round(planes, 9), axis=0, return_index=True)[1]]
-    if len(planes) <= _MOST_FACES:
-        return planes[:, :3], -planes[:, 3]
-    k = np.arange(_MOST_FACES) + 0.5
-    polar, angle = np.arccos(1 - 2 * k / _MOST_FACES), np.pi * (1 + 5**0.5) * k
-    x, y = np.cos(angle) * np.sin(polar), np.sin(angle) * np.sin(polar)
-    A = np.column_stack([x, y, np.cos(polar)])
-    return A, (A @ points.T).max(axis=1)
 
 
 def body_frames(model: RobotModel) -> dict[str, list[Array]]:

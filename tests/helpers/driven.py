@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from helpers.synthetic import perfect
+from robotid.cli.identify import identify
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.motions import random_fourier
@@ -13,7 +14,7 @@ from robotid.dynamics.simulation.simulator import Noise
 from robotid.dynamics.simulation.truth import another_robot
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.recorded import Recordings, hold_log
-from robotid.identification.pipeline import identify, with_drives
+from robotid.identification.pipeline import with_drives
 from robotid.robot.drives import AUTO, wanted_families
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -18,7 +18,7 @@ from robotid.diagnosis.urdf.inspection import inspect_urdf
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.output.files.urdf import write_urdf
 from robotid.output.viewer.scene import robot_scene
-from robotid.robot.geometry import body_boxes, geometry_half_spaces
+from robotid.robot.geometry import body_boxes
 from robotid.robot.mass_matrix import check_mass_matrix
 from robotid.robot.model import RobotModel
 
@@ -48,9 +48,7 @@ def run_urdf(case: HostileUrdf, folder: Path) -> None:
         pi = model.standard_parameters()
         assert np.isfinite(pi).all()
         described(body_boxes, model)
-        for shape in ("box", "hull"):
-            with contextlib.suppress(RobotIdError):
-                described(geometry_half_spaces, model, shape)
+
         described(check_mass_matrix, model, pi, poses=10)
         described(robot_scene, model)
         described(write_urdf, model, pi, folder / "new.urdf", dynamics=True)

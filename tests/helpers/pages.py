@@ -57,10 +57,10 @@ def charts(html):
     scripts = "//figure[@class='chart']//script[@type='application/json']"
     for script in lxml.html.fromstring(html).xpath(scripts):
         chart = json.loads(script.text)
-        chart["x"] = unpacked(chart["x"])
+        chart["x"] = numbers_of(chart["x"])
         for series in chart["series"]:
-            series["y"] = unpacked(series["y"])
-            series["half"] = None if series["half"] is None else unpacked(series["half"])
+            series["y"] = numbers_of(series["y"])
+            series["half"] = None if series["half"] is None else numbers_of(series["half"])
         found.append(chart)
     return found
 
@@ -71,13 +71,15 @@ def chart(html, title):
     return found
 
 
-def unpacked(packed):
-    """Return the numbers of an array in a page, the last code as NaN."""
-    codes = np.frombuffer(base64.b64decode(packed["data"]), f"<u{packed['bits'] // 8}")
-    last = 2 ** packed["bits"] - 1
-    values = packed["low"] + codes / (last - 1) * (packed["high"] - packed["low"])
-    values = np.where(codes == last, np.nan, values)
-    return 10.0**values if packed["log"] else values
+def numbers_of(packed):
+    """Return the numbers of an array in a page; of steps, the last code is NaN."""
+    codes = np.frombuffer(base64.b64decode(packed["data"]), packed["kind"])
+    codes = codes.reshape(packed["shape"])
+    if "step" not in packed:
+        return codes
+    values = np.array(packed["low"]) + np.array(packed["step"]) * codes
+    values = np.where(codes == np.iinfo(codes.dtype).max, np.nan, values)
+    return 10.0**values if packed.get("log") else values
 
 
 def bars(html):

@@ -34,6 +34,17 @@ def test_figure_4_is_the_control_of_its_joint_by_iterations(studies):
             close(upper["series"][-1]["y"], program[:-1, joint])
 
 
+def test_figure_3_is_the_program_motion_of_its_joint():
+    drawn = charts(page._program_figures())
+    t = np.linspace(0.0, 1.0, 201)  # over the duration of 2 s
+    shape = 10 * t**3 - 15 * t**4 + 6 * t**5  # (28)
+    rate, curvature = (30 * t**2 * (1 - t) ** 2 / 2, 60 * t * (1 - t) * (1 - 2 * t) / 4)
+    parts = [amplitude * x for amplitude in (1.0, 1.5) for x in (shape, rate, curvature)]
+    for what, wanted in zip(drawn, parts, strict=True):
+        close(what["x"], 2.0 * t)
+        close(what["series"][0]["y"], wanted)
+
+
 def test_figure_5_is_each_parameter_beside_its_true_value(studies):
     html = page._estimate_figures(studies)
     for study in studies:

@@ -137,13 +137,25 @@ def test_the_inertial_vector_is_in_the_papers_order(shown, content, folder, html
     np.testing.assert_allclose(found[[4, 6, 14, 16]], true[[4, 6, 14, 16]] / 2)
 
 
+def test_the_page_is_good_only_if_every_model_has_converged(content):
+    for last, status in (((5e-5, 5e-5, 9e-5), "good"), ((5e-5, 2e-4, 5e-5), "poor")):
+        models = {
+            name: {**model, "relative_error": [0.5, error]}
+            for (name, model), error in zip(content["models"].items(), last, strict=True)
+        }
+        assert f'class="verdict {status}"' in paper._summary({**content, "models": models})
+
+
 def test_a_case_is_judged_at_its_end_by_a_tenth_and_by_the_mean_of_the_later_half(rng):
     P, count = np.array([3.0, -4.0]), len(CASES)
     errors = np.append(0.5 * 0.9 ** np.arange(20), 5e-5)
     estimates = P + rng.standard_normal((21, count, 2))
+    history = SimpleNamespace(estimates=estimates, prx=np.ones((20, count)))
     study = SimpleNamespace(
-        P=P, history=SimpleNamespace(estimates=estimates), errors=lambda case: errors
-    )
+        P=P, history=history, NA=None, dynamics=SimpleNamespace(names=("p1", "p2")),
+        errors=lambda case="clean": errors,
+    )  # fmt: skip
+    assert paper._model(study)["converged"] is True
     for k, case in enumerate(CASES):
         found = paper._case(study, case)
         mean = estimates[-10:, k].mean(axis=0)  # of 21, five tenths of two each
@@ -154,6 +166,6 @@ def test_a_case_is_judged_at_its_end_by_a_tenth_and_by_the_mean_of_the_later_hal
         assert found["conditions"] == CASES[case].title
     errors = 2.0 * errors + 1e-6
     said = {case: paper._case(study, case) for case in ("on_program", "noisy")}
-    assert not any(found["converged"] for found in said.values())
+    assert not any(found["converged"] for found in (*said.values(), paper._model(study)))
     assert said["on_program"]["reason"].startswith("slow: every run follows the same curve")
     assert said["noisy"]["reason"].startswith("A disturbance v is part of the deviation")

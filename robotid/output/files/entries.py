@@ -9,13 +9,14 @@ import numpy as np
 
 from robotid.base.files import finite, source_entry
 from robotid.base.settings import require_kind
+from robotid.base.typing import Array
 from robotid.base.versions import __version__, versions
 from robotid.data.signal_settings import Transmission
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.drive_terms import DriveChoice
 from robotid.estimation.fitting.evaluation import LEFT_OUT, Evaluated, Evaluation
-from robotid.estimation.fitting.fitted import SOURCES, Identified, next_errors, typical_friction
+from robotid.estimation.fitting.fitted import SOURCES, Identified, next_errors
 from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.output.files.ranges import covariance_entry, parameter_ranges
@@ -132,7 +133,10 @@ def _variation(found: TorqueIdentification) -> dict[str, Any]:
 def build_preview(preview: "Preview") -> dict[str, Any]:
     """Return the content of a preview: plain values, all numbers finite."""
     found, noise = preview.expected, preview.noise
-    bodies, drives = parameter_entries(found)
+    bodies, drives = (
+        [{key: x for key, x in entry.items() if key not in ("value", "at_bound")} for entry in part]
+        for part in parameter_entries(found)
+    )
     keys = ("name", "expression", "std_error", "unit")
     base = [
         {key: entry[key] for key in keys} | {"plausible": float(spread)}
@@ -160,8 +164,8 @@ def build_preview(preview: "Preview") -> dict[str, Any]:
         "undetermined": list(found.determination.undetermined),
         "words": preview.words,
         "base_parameters": base,
-        "standard_parameters": [_without_value(entry) for entry in bodies],
-        "drive_parameters": [_without_value(entry) for entry in drives],
+        "standard_parameters": bodies,
+        "drive_parameters": drives,
         "torque": _expected_torque(preview),
     }
 
@@ -169,23 +173,16 @@ def build_preview(preview: "Preview") -> dict[str, Any]:
 def _friction(found: TorqueIdentification, drive: DriveChoice) -> dict[str, Any]:
     """Return the friction terms of a joint, and the terms that were tried."""
     own = [term for term in found.model.layout.terms if TERMS[term].is_friction]
-    choice = drive.to_dict()
+    choice, row = drive.to_dict(), found.model.row_names.index(drive.joint)
+    runs = [e.recording for e in found.fitted]
+    moves = any(run.trajectory.v[run.mask[:, row], row].any() for run in runs)
     return {
         "terms": [*own, *drive.families],
         **choice,
-        **_curve(found, drive.joint),
+        **({"curve": found.friction(drive.joint).to_dict()} if moves else {}),
         "on_misfit": [name for name in found.on_misfit if name.startswith(f"{drive.joint}.")],
         "tried": [{"terms": [*own, *tried["families"]], **tried} for tried in choice["tried"]],
     }
-
-
-def _curve(found: TorqueIdentification, joint: str) -> dict[str, Any]:
-    """Return the friction of a joint over its speed; nothing if no log moves it."""
-    row = found.model.row_names.index(joint)
-    speeds = [e.recording.trajectory.v[e.recording.mask[:, row], row] for e in found.fitted]
-    if not np.any(np.concatenate(speeds)):
-        return {}
-    return {"curve": typical_friction(found, joint).to_dict()}
 
 
 def _structure(found: Identified) -> dict[str, Any]:
@@ -208,19 +205,16 @@ def _determined(found: TorqueIdentification) -> dict[str, Any]:
     }
 
 
-def _without_value(entry: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: x for key, x in entry.items() if key not in ("value", "at_bound")}
-
-
 def _expected_torque(preview: "Preview") -> dict[str, dict[str, Any]]:
     """Return RMS torque and RMS half width of the 95 % band of each joint on the motions."""
     found, bands = preview.expected, preview.bands
-    torque = np.vstack([e.recording.trajectory.tau for e in found.fitted])
-    of_parameters = QUANTILE * np.sqrt(
-        np.mean(np.vstack([b.parameters for b in bands]) ** 2, axis=0)
-    )
-    half = QUANTILE * np.sqrt(np.mean(np.vstack([b.total for b in bands]) ** 2, axis=0))
-    rms = np.sqrt(np.mean(torque**2, axis=0))
+
+    def rms_of(parts: list[Array]) -> Array:
+        return np.asarray(np.sqrt(np.mean(np.vstack(parts) ** 2, axis=0)))
+
+    rms = rms_of([e.recording.trajectory.tau for e in found.fitted])
+    of_parameters = QUANTILE * rms_of([band.parameters for band in bands])
+    half = QUANTILE * rms_of([band.total for band in bands])
     model = found.model
     return {
         row: {
@@ -271,17 +265,11 @@ def _motors(
     model, gears = found.model, dict[str, float]()
     for table in settings.get("transmission", ()):
         gears |= Transmission.from_dict(table).stated(model.tree.reductions).gears
-    drives = [
-        (model.layout.drives[d].name, value)
-        for (d, term), value in zip(
-            model.layout.drive_parameters, found.standard[model.layout.n_inertial :], strict=True
-        )
-        if term.is_inertia
-    ]
+    values = found.standard[model.layout.n_inertial :]
     return {
         name: {"gear": gears[name], "inertia": float(value) / gears[name] ** 2}
-        for name, value in drives
-        if name in gears
+        for (d, term), value in zip(model.layout.drive_parameters, values, strict=True)
+        if term.is_inertia and (name := model.layout.drives[d].name) in gears
     }
 
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
-from robotid.base.settings import require_each, require_kind
+from robotid.base.settings import require_kind
 from robotid.base.typing import Array
 from robotid.output.files.exports import Exported, Format, Option, Written
 from robotid.output.files.links import WORLD, SimulatedLink, XmlFormat, own_drives, write_model
@@ -157,11 +157,7 @@ def write_mjcf(
     history of commands, which needs MuJoCo 3.5, or a first-order filter with the same delay at low
     frequencies. The position of such a joint is the reading of its encoder (``ref``).
     """
-    require_kind(model, RobotModel, "model", "a robotid.RobotModel")
     require_kind(step, (float, int), "step", "a time [s]")
-    require_kind(delay, str, "delay", f"one of {listed(DELAYS)}")
-    require_each(commanded, CommandedDrive, "commanded", "a list of drives")
-    require_kind(notes, (list, tuple), "notes", "a list of sentences")
     if not 0 < step < np.inf:
         raise SettingsError(f"step is {step:g} s, wanted a positive time")
     if delay not in DELAYS:

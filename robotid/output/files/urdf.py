@@ -18,7 +18,6 @@ import numpy as np
 from robotid.base.exceptions import DataError, ModelError
 from robotid.base.files import check_folder, folder_beside, read_json
 from robotid.base.findings import listed
-from robotid.base.settings import require_kind
 from robotid.base.typing import Array
 from robotid.base.versions import __version__
 from robotid.dynamics.friction_projection import Projection
@@ -61,8 +60,6 @@ def write_urdf(
     those of pi or those of a projection, which the sidecar then states. Returns the path of the
     sidecar, ``<target stem>.drive.json``.
     """
-    require_kind(model, RobotModel, "model", "a robotid.RobotModel")
-    require_kind(target, (str, Path), "target", "the path of a URDF to write")
     source, goal = Path(model.tree.path), Path(target)
     written = link_parameters(model, pi)
     _check_target(source, goal)
@@ -210,7 +207,6 @@ def _drive_value(drives: Mapping[str, Any], name: str, where: str) -> float:
 
 def _check_parameters(model: RobotModel, pi: Array) -> None:
     wanted = (len(model.layout.names),)
-    require_kind(pi, np.ndarray, "pi", f"an array of shape {wanted}")
     if pi.shape != wanted:
         raise DataError(f"pi has shape {pi.shape}, wanted {wanted}")
     for name, value in zip(model.layout.names, pi, strict=True):

@@ -5,7 +5,6 @@ no process, socket or port is needed.
 """
 
 import itertools
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,8 +21,8 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import write_text
 from robotid.base.settings import is_number, require_each, require_kind
 from robotid.base.typing import Array, real_numbers
-from robotid.output.pages.html import asset, scaffold
-from robotid.output.viewer.scene import coordinates, mass_marks, packed, robot_scene
+from robotid.output.pages.html import asset, packed, scaffold, script_json, stepped
+from robotid.output.viewer.scene import coordinates, mass_marks, robot_scene
 from robotid.robot.model import RobotModel
 
 _ASSETS = Path(__file__).parent / "assets"
@@ -137,21 +136,19 @@ def replay(
         DataError: If times and values are inconsistent with each other or with the model.
         SettingsError: If the rate is not positive.
     """
-    for name, value, kinds, wanted in (
-        ("model", model, RobotModel, "a robotid.RobotModel"),
-        ("torques", torques, (Torques, type(None)), "Torques"),
-        ("masses", masses, (Mapping, type(None)), "a table of standard parameters by label"),
-        ("ghosts", ghosts, (Mapping, type(None)), "a table of motions (t, q) by label"),
-        ("bands", bands, (Bands, type(None)), "Bands"),
-    ):
-        require_kind(value, kinds, name, wanted)
+    require_kind(model, RobotModel, "model", "a robotid.RobotModel")
+    for name, value, kind, wanted in (
+        ("torques", torques, Torques, "Torques"), ("bands", bands, Bands, "Bands"),
+        ("masses", masses, Mapping, "a table of standard parameters by label"),
+        ("ghosts", ghosts, Mapping, "a table of motions (t, q) by label"),
+    ):  # fmt: skip
+        require_kind(value, (kind, type(None)), name, wanted)
     require_each(marks, Mark, "marks", "a list of marks")
     require_each(notes, str, "notes", "a list of sentences")
     require_kind(log, str, "log", "the name of a file")
     for label, pi in (masses or {}).items():
         _check_masses(model, label, pi)
     _check(t, q, rate)
-    moved = _moved(model, t, q, rate)
     others = dict(ghosts or {})
     for label, path in others.items():
         require_each([label], str, "the label of a ghost", "text")
@@ -166,11 +163,8 @@ def replay(
         "scene": scene.content,
         "start": float(t[0]),
         "log": log,
-        "motion": _packed_motion(*moved),
-        "ghosts": [
-            {"label": label, **_packed_motion(*_moved(model, *path, rate))}
-            for label, path in others.items()
-        ],
+        "motion": _moved(model, t, q, rate),
+        "ghosts": [{"label": x, **_moved(model, *path, rate)} for x, path in others.items()],
         "masses": [mass_marks(model, pi, label) for label, pi in (masses or {}).items()],
         "torques": None if torques is None else _torque_data(model, torques, t),
         "bands": None if bands is None else _band_data(bands, float(t[0])),
@@ -217,10 +211,8 @@ def _check(t: Array, q: Array, rate: float) -> None:
 
 def _keyframes(t: Array, rate: float, most: int) -> Array:
     """Return the samples to show: the last before each tick of the rate, and the last one."""
-    count = min(int((t[-1] - t[0]) * rate) + 2, max(most, 2))
-    ticks = np.linspace(t[0], t[-1], count)
-    rows: Array = np.unique(np.searchsorted(t, ticks, side="right") - 1)
-    return rows
+    ticks = np.linspace(t[0], t[-1], min(int((t[-1] - t[0]) * rate) + 2, max(most, 2)))
+    return np.unique(np.searchsorted(t, ticks, side="right") - 1)
 
 
 def _gaps(t: Array) -> list[int]:
@@ -228,7 +220,7 @@ def _gaps(t: Array) -> list[int]:
     return np.flatnonzero((steps > _GAP) & (steps > _TIMES * np.median(steps))).tolist()
 
 
-def _moved(model: RobotModel, t: Array, q: Array, rate: float) -> tuple[Array, Array]:
+def _moved(model: RobotModel, t: Array, q: Array, rate: float) -> dict[str, Any]:
     """Return times from 0 and the displacement of each joint, at the keyframes."""
     model.configurations(q)  # refuses a wrong width of q
     q = q.copy()
@@ -239,19 +231,15 @@ def _moved(model: RobotModel, t: Array, q: Array, rate: float) -> tuple[Array, A
         turn = (q[1:, 3:7] * q[:-1, 3:7]).sum(axis=1) < 0
         q[1:, 3:7] *= np.where(np.cumsum(turn) % 2, -1.0, 1.0)[:, None]
     rows = _keyframes(t, rate, _NUMBERS // q.shape[1])
-    return t[rows] - t[0], coordinates(model, q[rows])
-
-
-def _packed_motion(t: Array, q: Array) -> dict[str, Any]:
-    return {"t": packed(t), "q": packed(q)}
+    return {"t": packed(t[rows] - t[0]), "q": packed(coordinates(model, q[rows]))}
 
 
 def _fixed_base(model: RobotModel) -> list[str]:
     """Return a note for a trunk with several limbs whose motion is unknown."""
-    tree = model.pin_model
-    limbs = sum(int(parent) == 0 for parent in list(tree.parents)[1:])
-    is_fixed = limbs > 1 and not model.free_flyer
-    return ["The base is drawn as fixed: the log has no pose of the base."] if is_fixed else []
+    limbs = sum(int(parent) == 0 for parent in list(model.pin_model.parents)[1:])
+    if limbs <= 1 or model.free_flyer:
+        return []
+    return ["The base is drawn as fixed: the log has no pose of the base."]
 
 
 def _torque_data(model: RobotModel, torques: Torques, t: Array) -> dict[str, Any]:
@@ -285,19 +273,8 @@ def _torque_data(model: RobotModel, torques: Torques, t: Array) -> dict[str, Any
         "scale": scale,
         "strips": strips,
         "t": packed(times),
-        "values": _stepped(values),
+        "values": stepped(values),
     }
-
-
-def _stepped(values: Array) -> dict[str, Any]:
-    """Return columns in half the bytes: steps of a 65,534th of their range; 65,535 is NaN."""
-    known = np.isfinite(values)
-    low = np.where(known, values, np.inf).min(axis=0, initial=np.inf)
-    high = np.where(known, values, -np.inf).max(axis=0, initial=-np.inf)
-    low, high = (np.where(np.isfinite(x), x, 0.0) for x in (low, high))
-    step = np.maximum((high - low) / 65_534, 1e-30)
-    steps = np.where(known, np.round((np.where(known, values, low) - low) / step), 65_535)
-    return {"low": low.tolist(), "step": step.tolist(), "codes": packed(steps, "<u2")}
 
 
 def _coded(levels: Array, of: Array) -> Array:
@@ -308,8 +285,8 @@ def _coded(levels: Array, of: Array) -> Array:
 
 def _band_data(bands: Bands, start: float) -> dict[str, Any]:
     t, values = _plotted(bands.t - start, np.hstack([bands.theta, bands.std_error]))
-    names = {"names": list(bands.names), "units": list(bands.units)}
-    return {**names, "t": packed(t), "values": packed(values)}
+    return {"names": list(bands.names), "units": list(bands.units), "t": packed(t),
+            "values": packed(values)}  # fmt: skip
 
 
 def _plotted(t: Array, values: Array) -> tuple[Array, Array]:
@@ -369,8 +346,7 @@ def page(data: Mapping[str, Any]) -> str:
     body = Template(_asset("replay.html")).substitute(
         title=escape(title),
         notes=" ".join(f"<p>{escape(note)}</p>" for note in data["notes"]),
-        # "<" is an escape in JSON, so no text in it can end the script
-        data=json.dumps(data, allow_nan=False).replace("<", "\\u003c"),
+        data=script_json(data),
         viewer=_viewer(),
         uplot=asset("uPlot.iife.min.js"),
         charts=asset("charts.js"),

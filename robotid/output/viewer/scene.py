@@ -1,6 +1,5 @@
 """The robot as scene of the viewer: joints as nodes, meshes or a skeleton as their parts."""
 
-import base64
 import itertools
 import os
 from collections import Counter
@@ -14,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from robotid.base.typing import Array
+from robotid.output.pages.html import packed, stepped
 from robotid.robot.geometry import Shape, Surface, find_mesh, joined, read_shapes, read_surfaces
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -45,13 +45,11 @@ def robot_scene(model: RobotModel) -> Scene:
     tree = model.pin_model
     parts, meshes, boxes, missing = _visuals(model)
     notes: tuple[str, ...] = ()
-    drawn = {part["node"] for part in parts}
     if missing:
         words = "meshes were not found or are not readable, for example"
         notes = (f"{len(missing)} {words} {missing[0]}",)
-    for i in range(tree.njoints):
-        if i not in drawn:
-            parts += _skeleton(model, i)
+    for i in sorted({*range(tree.njoints)} - {part["node"] for part in parts}):
+        parts += _skeleton(model, i)
     content = {
         "nodes": [_node(model, i) for i in range(tree.njoints)],
         "parts": parts,
@@ -108,13 +106,6 @@ def ellipsoid(J: Array) -> dict[str, Any]:
     return {"mass": m, **place, "fault": ""}
 
 
-def packed(values: Array, kind: str = "<f4") -> dict[str, Any]:
-    """Return an array for the page: base64 of little-endian numbers."""
-    array = np.ascontiguousarray(values, dtype=kind)
-    data = base64.b64encode(array.tobytes()).decode("ascii")
-    return {"kind": kind, "shape": list(array.shape), "data": data}
-
-
 def _visuals(
     model: RobotModel,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]], list[Array], list[str]]:
@@ -127,13 +118,16 @@ def _visuals(
     thinned = _thinned(tuple(files.values()), tuple(uses[key] for key in files))
     numbers: dict[tuple[str, tuple[float, ...]], list[tuple[int, Surface]]] = {}
     for key, surfaces in zip(files, thinned, strict=True):
-        if surfaces is None:
+        if not surfaces:
             missing.append(key[0])
-        shown = [surface for surface in surfaces or () if len(surface.faces)]
-        numbers[key] = [*enumerate(shown, len(meshes))]
-        for surface in shown:
+        numbers[key] = [*enumerate(surfaces, len(meshes))]
+        for surface in surfaces:
             boxes.append(np.array([surface.vertices.min(0), surface.vertices.max(0)]))
-            meshes.append(_packed_mesh(surface, boxes[-1]))
+            kind = "<u2" if len(surface.vertices) <= 2**16 else "<u4"
+            meshes.append(
+                {"vertices": stepped(surface.vertices), "faces": packed(surface.faces, kind),
+                 "closed": surface.is_closed}
+            )  # fmt: skip
     for visual in visuals:
         parts += _visual_parts(model, visual, numbers.get((visual.file, visual.size), []))
     return parts, meshes, boxes, missing
@@ -146,34 +140,18 @@ def _file(model: RobotModel, visual: Shape) -> _File:
 
 
 @lru_cache(maxsize=4)  # thinning needs seconds, and a robot has many pages
-def _thinned(files: tuple[_File, ...], uses: tuple[int, ...]) -> tuple[list[Surface] | None, ...]:
-    """Return each file's scaled surfaces, thinned for a page; None if it is not readable."""
-    found: list[list[Surface] | None] = []
+def _thinned(files: tuple[_File, ...], uses: tuple[int, ...]) -> list[list[Surface]]:
+    """Return each file's scaled surfaces, thinned for a page; none if it is not readable."""
+    solids, sizes = [], []
     for path, scale, _ in files:
         try:
-            read = () if path is None else read_surfaces(path)
+            patches = () if path is None else read_surfaces(path)
         except ValueError:
-            read = ()
-        scaled = [replace(s, vertices=s.vertices * np.array(scale)) for s in read]
-        found.append(scaled or None)
-    sizes = [sum(len(s.faces) for s in surfaces or []) for surfaces in found]
-    drawn = sum(size * count for size, count in zip(sizes, uses, strict=True))
-    most = _TRIANGLES * sum(sizes) // max(drawn, 1)  # files of four equal legs count four times
-    thinned = thin([surfaces or [] for surfaces in found], most)
-    return tuple(t if f else None for t, f in zip(thinned, found, strict=True))
-
-
-def _packed_mesh(surface: Surface, box: Array) -> dict[str, Any]:
-    """Return triangles in half the bytes: corners in steps of a 65,535th of their box (2, 3)."""
-    low, step = box[0], np.maximum(np.ptp(box, axis=0), 1e-9) / 65_535
-    kind = "<u2" if len(surface.vertices) <= 2**16 else "<u4"
-    return {
-        "low": low.tolist(),
-        "step": step.tolist(),
-        "vertices": packed(np.round((surface.vertices - low) / step), "<u2"),
-        "faces": packed(surface.faces, kind),
-        "closed": surface.is_closed,
-    }
+            patches = ()
+        solids.append([replace(s, vertices=s.vertices * np.array(scale)) for s in patches])
+        sizes.append(sum(len(s.faces) for s in patches))
+    drawn = int(np.dot(sizes, uses))  # files of four equal legs count four times
+    return thin(solids, _TRIANGLES * sum(sizes) // max(drawn, 1))
 
 
 def _visual_parts(
@@ -186,8 +164,7 @@ def _visual_parts(
         M = M @ _from_y_axis(np.array([0.0, 0.0, 1.0]), np.zeros(3))
     if visual.kind == "mesh":
         for k, surface in which:
-            colour = _hex(surface.rgba or visual.rgba)
-            yield _part(frame.parentJoint, "mesh", [k], colour, M)
+            yield _part(frame.parentJoint, "mesh", [k], _hex(surface.rgba or visual.rgba), M)
     else:
         yield _part(frame.parentJoint, visual.kind, visual.size, _hex(visual.rgba), M)
 
@@ -228,9 +205,8 @@ def _hex(rgba: Sequence[float] | None) -> str:
 def _node(model: RobotModel, i: int) -> dict[str, Any]:
     tree = model.pin_model
     M = tree.jointPlacements[i]
-    base = 1 if model.free_flyer else 0
     kind, axis = _movement(model, i)
-    column = tree.joints[i].idx_v + base if kind != "fixed" else -1
+    column = tree.joints[i].idx_v + int(model.free_flyer) if kind != "fixed" else -1
     return {
         "name": tree.names[i],
         "parent": int(tree.parents[i]) if i else -1,
@@ -252,8 +228,7 @@ def _movement(model: RobotModel, i: int) -> tuple[str, list[float]]:
     data = kind.createData()
     kind.calc(data, pin.neutral(model.pin_model), np.zeros(model.pin_model.nv))
     S = np.array(data.S).reshape(6)
-    is_revolute = bool(S[3:].any())
-    return ("revolute", S[3:].tolist()) if is_revolute else ("prismatic", S[:3].tolist())
+    return ("revolute", S[3:].tolist()) if S[3:].any() else ("prismatic", S[:3].tolist())
 
 
 def _skeleton(model: RobotModel, joint: int) -> Iterator[dict[str, Any]]:
@@ -277,17 +252,13 @@ def _skeleton(model: RobotModel, joint: int) -> Iterator[dict[str, Any]]:
 def _ends(model: RobotModel, joint: int) -> list[Array]:
     """Return the end points of a joint's links: its children, or its farthest fixed frame."""
     tree = model.pin_model
-    children = [
-        np.array(tree.jointPlacements[i].translation)
-        for i in range(1, tree.njoints)
-        if tree.parents[i] == joint
-    ]
     if joint == 0 and model.free_flyer:
         return []
+    children = [k for k in range(1, tree.njoints) if tree.parents[k] == joint]
+    if children:
+        return [np.array(tree.jointPlacements[k].translation) for k in children]
     frames = [np.array(f.placement.translation) for f in tree.frames if f.parentJoint == joint]
-    if children or not frames:
-        return children or [np.array(tree.inertias[joint].lever)]
-    farthest = max(frames, key=lambda point: float(np.linalg.norm(point)))
+    farthest = max(frames, key=np.linalg.norm, default=np.zeros(3))
     is_point = np.linalg.norm(farthest) < _SHORT
     return [np.array(tree.inertias[joint].lever) if is_point else farthest]
 
@@ -297,9 +268,8 @@ def _reach(model: RobotModel) -> float:
     tree = model.pin_model
     paths = [0.0] * tree.njoints
     for i in range(1, tree.njoints):
-        paths[i] = paths[tree.parents[i]] + float(
-            np.linalg.norm(tree.jointPlacements[i].translation)
-        )
+        length = np.linalg.norm(tree.jointPlacements[i].translation)
+        paths[i] = paths[tree.parents[i]] + float(length)
     return max(0.1, *paths)
 
 

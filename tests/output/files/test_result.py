@@ -128,6 +128,15 @@ def test_metrics_are_those_of_the_prediction_they_name(result, identified, name)
     assert kept["log"] == identified.validation[0].recording.log.path
     assert_metrics(kept, figures(identified, identified.validation, name))
     assert identified.validation[0].to_dict(name).items() <= kept.items()
+    if name == "estimate":
+        evaluation, motion = identified.validation[0], identified.validation[0].recording
+        band = identified.band(evaluation)
+        rows = (motion.trajectory.tau, evaluation.torques["estimate"], motion.mask)
+        for j, share in enumerate(band.coverage(*rows)):
+            said = kept["band"][identified.model.joints[j]]
+            assert said["coverage_pct"] == pytest.approx(100 * share)
+            half = 1.96 * np.sqrt(np.mean(band.total[:, j] ** 2))
+            assert said["half_width"] == pytest.approx(half, rel=1e-5)
     other = result["wls"] if name == "estimate" else result
     joints = part["validation"][0]["per_joint"]
     for joint, row in other["validation"][0]["per_joint"].items():

@@ -125,6 +125,29 @@ def test_drives_have_the_quantiles_of_the_next_log_and_its_correlation(folder):
     assert abs(found[0, 2]) < 0.12
 
 
+def test_drives_correlate_as_the_fit_by_its_share_of_the_next_error(folder):
+    """A mean of 0.8 of the next log's error: 0.64 of its variance correlates as the fit does."""
+    result = load_result(folder)
+    names, every = ["wrist_1_joint.viscous", "wrist_1_joint.coulomb"], result.content["covariance"]
+    root = [[] for _ in every["names"]]
+    first, second = (every["names"].index(name) for name in names)
+    root[first] = [*[0.0] * first, 100.0]
+    root[second] = [*[0.0] * first, 95.0, *[0.0] * (second - first - 1), 31.2]
+    entries = {}
+    for name in names:
+        mean = result.parameters[result.robot.layout.names.index(name)]
+        s = 0.01 * mean
+        ends = [mean - 1.96 * s, mean + 1.96 * s]
+        entries[name] = {"std_error": 0.8 * s, "next_interval": ends,
+                         "next_quantiles": (mean + s * SCORES).tolist()}  # fmt: skip
+    variation = {"parameters": entries, "correlation": np.eye(2).tolist()}
+    covariance = {"names": every["names"], "root": root}
+    content = {**result.content, "covariance": covariance, "variation": variation}
+    _, values = sample(replace(result, content=content), 2000, np.random.default_rng(2))
+    R = np.corrcoef(values[:, [first, second]].T)
+    assert R[0, 1] == pytest.approx(0.64 * 0.95, abs=0.06)
+
+
 def test_drives_of_commands_have_no_sample_below_zero(tmp_path):
     robot = plant("planar", np.random.default_rng(0))
     size = len(robot.model.standard_parameters())

@@ -2,7 +2,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from robotid.output.viewer.scene import _corners, ellipsoid, robot_scene
+from robotid.output.viewer.scene import _corners, ellipsoid, mass_marks, robot_scene
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
@@ -19,6 +19,14 @@ def test_the_ellipsoid_of_a_solid_ellipsoid_is_itself(rng):
         axes = pin.Quaternion(np.array(found["quaternion"])).matrix()
         # the axes agree but for their signs
         np.testing.assert_allclose(np.abs(axes.T @ M.rotation), np.eye(3), atol=1e-7)
+
+
+def test_each_mass_hangs_on_the_node_of_its_body(ur5):
+    marks = mass_marks(ur5, ur5.standard_parameters(), "URDF")["bodies"]
+    assert [(x["name"], x["node"]) for x in marks] == [
+        (body, ur5.pin_model.frames[ur5.pin_model.getFrameId(body)].parentJoint)
+        for body in ur5.layout.bodies
+    ]
 
 
 @pytest.mark.parametrize(
