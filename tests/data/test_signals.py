@@ -111,11 +111,7 @@ def test_what_is_stated_to_be_late_is_moved_back(rate):
     late = sine_log(t, lag=0.03)  # of the velocity
     tau = np.column_stack([np.cos(w * (t - 0.05)), np.sin(w * (t - 0.05))])
     settings = SignalSettings(
-        cutoff=None,
-        rate=rate,
-        velocity="measured",
-        torque_delay=0.05,
-        velocity_delay=0.03,
+        cutoff=None, rate=rate, velocity="measured", torque_delay=0.05, velocity_delay=0.03
     )
     forces = {"fz a": np.cos(w * t), "fx a": np.sin(w * t)}
     log = Log(t=t, q=late.q, v=late.v, tau=tau, joints=late.joints, wrenches=forces)

@@ -10,14 +10,7 @@ from scipy.signal import butter
 from robotid.data.base_motion import BaseMotion
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.data.signals import (
-    SPLINE,
-    Segment,
-    filter_reach,
-    process,
-    process_segments,
-    resolve,
-)
+from robotid.data.signals import SPLINE, Segment, filter_reach, process, process_segments, resolve
 
 RATE = 200.0  # [Hz]
 PART = 700  # rows

@@ -13,6 +13,7 @@ from robotid.robot.bodies import (
     link_places,
     principal_moments,
 )
+from robotid.robot.drives import Lag
 from robotid.robot.examples import example_urdf
 from robotid.robot.mass_matrix import carried_inertia
 from robotid.robot.model import RobotModel
@@ -105,8 +106,8 @@ def test_a_massless_link_still_has_a_spread(rng, ur5):
 def test_the_spread_is_what_the_docstring_says(ur5):
     rms = np.array([2.0, 3.0, 5.0])[:, None] * np.ones((3, 6))
     rms[0] *= np.arange(1, 7)  # each joint has its own torque
-    squares, samples = 16 * rms**2, 16
-    spread = dict(zip(ur5.layout.names, prior_spread(ur5, squares, samples), strict=True))
+    model = ur5.with_terms({"elbow_joint": [Lag()]})
+    spread = dict(zip(model.layout.names, prior_spread(model, 16 * rms**2, 16), strict=True))
     inertial = ur5.tree.inertials["forearm_link"]
     mass, centre = inertial.mass, np.linalg.norm(ur5.standard_parameters()[21:24]) / inertial.mass
     J = pseudo_inertia(ur5.standard_parameters()[:60])[2]
@@ -115,6 +116,7 @@ def test_the_spread_is_what_the_docstring_says(ur5):
     assert spread["forearm_link.Ixx"] == pytest.approx(mass * radius**2)
     assert spread["elbow_joint.viscous"] == pytest.approx(6.0 / 3.0)
     assert spread["wrist_1_joint.coulomb"] == pytest.approx(8.0)
+    assert spread["elbow_joint.lag"] == pytest.approx(3.0 / 5.0)  # its rate is tau a / v
     carried = dict(zip(ur5.joints, carried_inertia(ur5), strict=True))
     heavy, light = "shoulder_lift_joint", "wrist_3_joint"
     assert carried[heavy] > 4.0 / 5.0

@@ -6,7 +6,6 @@ import pytest
 from helpers.synthetic import truth
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.mass_matrix import check_mass_matrix, joint_mass_matrices
@@ -123,22 +122,12 @@ def test_a_slider_counts_by_its_stroke_and_a_coupling_by_the_mean_of_its_joints(
     np.testing.assert_allclose(layout.scales(length), wanted)  # an armature of a slider is a mass
 
 
-EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
-NOISE = np.array([1.0, 0.3, 0.2])  # [N m]
-
-
-@pytest.fixture(scope="module")
-def forearm(ur5):
-    """The elbow of a UR5 and two joints of its wrist."""
-    return RobotModel.from_urdf(ur5.tree.path, joints=ur5.joints[2:5])
-
-
-def test_it_is_what_accelerations_cost_armatures_and_couplings_included(rng):
+def test_it_is_what_accelerations_cost_armatures_and_couplings_included(rng, ur5):
     # tau(q, 0, a) - tau(q, 0, 0) = M a
     coupling = Coupling("motor", (("wrist_2_joint", 1.0), ("wrist_3_joint", -2.0)))
-    model = RobotModel.from_urdf(
-        example_urdf("ur5_robot.urdf"), terms=("armature", "offset"), couplings=(coupling,)
-    )
+    path, joints = example_urdf("ur5_robot.urdf"), [ur5.joints[k] for k in (2, 0, 1, 4, 5, 3)]
+    terms = ("armature", "offset")
+    model = RobotModel.from_urdf(path, joints=joints, terms=terms, couplings=(coupling,))
     pi, q = truth(model), rng.uniform(-2, 2, (3, 6))
     pi[-1] = 0.3
     M = joint_mass_matrices(model, pi, q)
