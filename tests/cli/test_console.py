@@ -11,6 +11,7 @@ import subprocess
 import sys
 import termios
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from helpers.paths import ROOT
 from robotid.base.findings import Finding
 from robotid.base.typing import STAGES
 from robotid.cli import doctor, main
+from robotid.cli.console import progress_of, recordings_of
 
 ARM = str(ROOT / "urdf" / "planar_2r.urdf")
 
@@ -142,6 +144,22 @@ def test_findings_are_told_by_cause_and_the_worst_joint_is_named(capsys):
     wrong.append(finding("arm_7", "five", 9, "error"))
     doctor._show(wrong, joints, {}, is_verbose=False, count=2)
     assert capsys.readouterr().out.splitlines()[-1].endswith("worst: arm_6"), "two errors"
+
+
+def test_a_stage_is_printed_once_and_files_of_one_name_with_their_folders(capsys):
+    with progress_of(SimpleNamespace(verbose=True)) as show:
+        for what, done, unit in (
+            ("fitting", 2, "stages"),
+            ("pieces", 0, "pieces"),
+            ("fitting", 2, "stages"),
+        ):
+            show(what, done, 5, unit)
+    assert capsys.readouterr().err == "robotid: 3/5 fitting\n"
+    paths = ["a/run.csv", "b/run.csv", "a/run.csv", "c/one.csv", ""]
+    logs = [{"path": x, "role": "fit", "start": k, "end": k + 2} for k, x in enumerate(paths)]
+    assert recordings_of([*logs, {"path": "c/one.csv", "role": "other"}], "fit") == [
+        "a/run.csv 0-2 s", "b/run.csv 1-3 s", "a/run.csv 2-4 s", "one.csv 3-5 s", "log 4-6 s",
+    ]  # fmt: skip
 
 
 CLOSED = {"no output": ">&-", "no errors": "2>&-", "neither": ">&- 2>&-"}

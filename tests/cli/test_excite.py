@@ -192,7 +192,8 @@ def test_every_flag_states_its_setting():
 def stated_by_flags(*words):
     parser = argparse.ArgumentParser()
     excite.add_flags(parser)
-    return excite.motion_settings(parser.parse_args(["arm.urdf", "--out", "m.csv", *words]))
+    options = parser.parse_args(["arm.urdf", "--out", "m.csv", *words])
+    return MotionSettings.from_dict(excite.MOTION.stated(options))
 
 
 def test_a_floating_base_and_a_robot_with_contacts_are_refused(tmp_path, capsys):

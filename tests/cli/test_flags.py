@@ -99,6 +99,17 @@ def test_gains_are_stated_for_all_joints_or_by_joint():
             job(identify, *fit, *words)
 
 
+def test_a_job_file_takes_neither_logs_nor_flags_beside_it():
+    for words, given in (
+        (["run.csv"], "run.csv"),
+        (["--cutoff", "5", "--validate", "b.csv"], "--validate, --cutoff"),
+    ):
+        parser = argparse.ArgumentParser()
+        identify.add_flags(parser)
+        with pytest.raises(SettingsError, match=f"settings. Remove {given}, and state them in"):
+            job_from_flags(parser.parse_args(["job.toml", *words]))
+
+
 @pytest.mark.parametrize(("command", "wanted"), [(identify, "URDF LOG"), (preview, "URDF MOT")])
 def test_a_command_without_a_log_names_what_it_wants(command, wanted):
     parser = argparse.ArgumentParser()
