@@ -290,8 +290,9 @@ def _job_of(identification: Identification) -> Job:
         choice, terms = chosen.get(name), model.layout.own.get(name, ())
         stated = [term for term in terms if choice is None or term not in choice.terms]
         families = (wanted.get(name) or ()) if choice is None else choice.families
-        if entries := (*(() if is_auto else families), *stated):
-            drives[name] = entries
+        entries: list[str | DriveTerm] = [*(() if is_auto else families), *stated]
+        if entries:
+            drives[name] = tuple(entries)
     return Job(
         urdf=Path(model.tree.path), joints=model.joints, locked=options["locked"],
         gravity=tuple(options["gravity"]), mimic=model.mimic,

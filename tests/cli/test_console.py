@@ -19,7 +19,7 @@ from helpers.paths import ROOT
 
 from robotid.base.findings import Finding
 from robotid.base.typing import STAGES
-from robotid.cli import doctor, main
+from robotid.cli import compare, doctor, main, paper
 from robotid.cli.console import progress_of, recordings_of
 
 ARM = str(ROOT / "urdf" / "planar_2r.urdf")
@@ -78,6 +78,10 @@ def test_a_result_names_recordings_with_their_windows_and_commands_that_work(arm
     _, fit, keep = result["inputs"]
     assert f"\nfitted: fit.csv {fit['start']:.4g}-{fit['end']:.4g} s\n" in said
     assert f"\nnot fitted: keep.csv {keep['start']:.4g}-{keep['end']:.4g} s\n" in said
+    before, after, _ = result["scale_check"]["masses"]
+    assert f"total mass {before:.2f} -> {after:.2f} kg" in said.replace("\n", " ")
+    errors = [x["relative_error_pct"] for x in result["validation"][0]["per_joint"].values()]
+    assert re.search(rf"worst: joint_\d, torque error {max(errors):.1f} %", said.replace("\n", " "))
     notes = sum(warning["severity"] == "note" for warning in result["warnings"])
     assert notes
     flat = " ".join(said.split())
@@ -160,6 +164,27 @@ def test_a_stage_is_printed_once_and_files_of_one_name_with_their_folders(capsys
     assert recordings_of([*logs, {"path": "c/one.csv", "role": "other"}], "fit") == [
         "a/run.csv 0-2 s", "b/run.csv 1-3 s", "a/run.csv 2-4 s", "one.csv 3-5 s", "log 4-6 s",
     ]  # fmt: skip
+
+
+def test_the_paper_and_base_parameters_are_printed_in_columns(capsys):
+    model = {"relative_error": [0.5, 0.25, 0.125], "NA": 7}
+    cases = {case: {"linear": {"relative_error": [1.0, 0.1 * k]}}
+             for k, case in enumerate(("disturbed", "noisy", "on program"), 1)}  # fmt: skip
+    runs = {"linear": {"converged": 3, "runs": 4}}
+    paper._show({"models": {"linear": model}, "trajectories": runs, **cases})
+    _, _, row, *_, last = capsys.readouterr().out.splitlines()
+    assert row.split() == ["linear", "0.5", "0.25", "0.12", "0.1", "0.2", "0.3", "7"]
+    assert last.split() == ["linear", "3", "of", "4"]
+    entries = [
+        {"name": f"p{k}", "values": [1.0, k], "std_errors": [0.1, 0.01], "unit": "kg",
+         "differences": [k]} for k in range(4)
+    ]  # fmt: skip
+    for limit, shown in ((2, 2), (3, 4), (None, 4)):
+        compare._print_base_parameters({"base_parameters": entries}, ["A", "B"], limit)
+        printed = capsys.readouterr().out
+        assert printed.count(" kg ") == shown
+        assert ("  2 more with smaller differences: --verbose" in printed) == (limit == 2)
+    assert "\n  p3  1.00  3.000  kg  3.0\n" in printed
 
 
 CLOSED = {"no output": ">&-", "no errors": "2>&-", "neither": ">&- 2>&-"}

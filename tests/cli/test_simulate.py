@@ -199,6 +199,20 @@ def test_a_limit_and_a_load_do_what_they_say_and_the_truth_states_it(arm, tmp_pa
     np.testing.assert_allclose(loaded - bare, mapping.to_base(load), atol=1e-9)
 
 
+def test_the_torque_of_a_drive_with_a_lag_is_logged_later(arm, tmp_path):
+    write_motion(tmp_path / "motion.csv", arm, 3, duration=2.0)
+    files = [arm.tree.path, str(tmp_path / "motion.csv"), "--out", str(tmp_path / "log.csv")]
+    plant, torques = tmp_path / "plant.toml", []
+    for lag in (0.0, 0.02):  # [s], of 200 Hz
+        values = f'[truth]\nvalues = {{ "joint_2.lag" = {lag} }}\n'
+        plant.write_text(f'{values}[drives]\njoint_2 = [{{ term = "Lag" }}]\n')
+        words = ["--plant", str(plant), "--rate", "200", "--controller", "pd"]
+        assert main(["simulate", *files, *words]) == 0
+        torques.append(read_log(tmp_path / "log.csv", arm.joints).tau)
+    np.testing.assert_array_equal(torques[1][:, 0], torques[0][:, 0])
+    np.testing.assert_allclose(torques[1][4:, 1], torques[0][:-4, 1], atol=1e-9)
+
+
 def motion_of(path, model):
     """Return instants, positions, velocities and accelerations of a motion's table."""
     log = read_log(path, model.joints, needs="motion")
