@@ -53,7 +53,6 @@ COMMANDS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line."""
     code = 0
     gc.set_threshold(_OBJECTS)
     atexit.register(gc.freeze)  # no search for cycles in all that the end of the process frees
@@ -204,8 +203,6 @@ class CommandParser(argparse.ArgumentParser):
 
 
 class _StoreOnce(argparse._StoreAction):
-    """Store the value of a flag; refuse a second value."""
-
     def __call__(
         self,
         parser: argparse.ArgumentParser,

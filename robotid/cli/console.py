@@ -31,7 +31,6 @@ def echo(text: str, indent: str = "", tone: str = "") -> None:
 
 
 def print_files(names: Sequence[str], folder: str = "") -> None:
-    """Print the files that were written, one per line."""
     print("\nwritten:", *(f"  {Path(folder) / name}" for name in names), sep="\n")
 
 
@@ -56,7 +55,6 @@ def print_causes(
     printed: Sequence[str] = (),
     none: str = "no findings",
 ) -> None:
-    """Print findings by cause, then their number."""
     from robotid.base.findings import grouped, tally
 
     shown = [f for f in findings if is_verbose or f.severity != "note"]

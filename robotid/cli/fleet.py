@@ -311,7 +311,6 @@ class _Gathered:
         self._verdicts.update([row["verdict"] for row in rows if row.get("verdict")][:1])
 
     def content(self, units: Sequence[FleetUnit]) -> dict[str, Any]:
-        """Return the content of fleet.json."""
         several = {key: found for key, found in self._values.items() if len(found) >= FEWEST_RUNS}
         n_tests = sum(map(len, several.values()))
         parameters, unlike = [], []

@@ -220,7 +220,6 @@ def save_result(
 
 
 def _names(model: RobotModel) -> tuple[str, str, str, str]:
-    """Return the names of report, replay, URDF and sidecar."""
     stem = Path(model.tree.path).stem
     return "report.html", "replay.html", f"{stem}.identified.urdf", f"{stem}.identified.drive.json"
 
@@ -415,7 +414,6 @@ def run(options: argparse.Namespace) -> int:
 def show_result(
     result: dict[str, Any], *, findings: Sequence[Finding] = (), is_verbose: bool = False
 ) -> None:
-    """Print an identification."""
     width, wls = terminal_width(), result.get("wls")
     echo(f"\n{result['robot']}: {len(result['joints'])} joints, {_found(result)}")
     roles = ("identification", "validation")

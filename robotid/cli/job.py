@@ -354,7 +354,6 @@ def as_job(robot: Job | str | Path) -> Job:
 def job_from_settings(
     table: Mapping[str, Any], where: str, folder: Path, *, expand: bool = False
 ) -> Job:
-    """Return the job that a table states."""
     check_keys(table, Job.schema(), where)
     if "urdf" not in table:
         raise SettingsError(f"{where} has no key 'urdf'; name the robot's URDF file")
@@ -378,7 +377,6 @@ def written_job(settings: Mapping[str, Any], where: str) -> Job:
 
 
 def stated_path(text: str, where: str, folder: Path, *, expand: bool) -> Path:
-    """Return a path relative to a folder."""
     try:
         check_path(text)
     except SettingsError as error:
@@ -576,13 +574,11 @@ def add_shown(parser: argparse.ArgumentParser, *names: str, **words: str) -> Non
 
 
 def add_out(parser: argparse.ArgumentParser, folder: str) -> None:
-    """Add the folder to write to."""
     words = f"folder to write to; default: {folder}"
     parser.add_argument("--out", default=folder, metavar="DIR", help=words)
 
 
 def add_work(parser: "argparse._ActionsContainer", default: str) -> None:
-    """Add the flags of worker processes and clusters."""
     words = f"worker processes; default: {default}"
     parser.add_argument("--workers", type=int, metavar="N", help=words)
     words = "address of a Dask cluster, as tcp://host:8786"

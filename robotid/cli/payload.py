@@ -35,7 +35,6 @@ _STAGES = ("reading logs", "fitting")
 
 
 def is_result(path: str | Path) -> bool:
-    """Return whether a reference is a result or its folder, not a log."""
     return Path(path).suffix == ".json" or (Path(path) / "result.json").is_file()
 
 
@@ -189,7 +188,6 @@ def _print_one_payload(found: Mapping[str, Any], check: Mapping[str, Any] | None
 
 
 def _print_values(values: Iterable[tuple[str, float, float | None]]) -> None:
-    """Print names and values in the digits of their errors."""
     rows = []
     for name, value, error in values:
         shown, half = in_digits_of(value, error)

@@ -144,7 +144,6 @@ def _truth(
 
 
 def _rows(**columns: Any) -> list[dict[str, Any]]:  # noqa: ANN401
-    """Return the rows of a table of lists and arrays."""
     plain = [x.tolist() if isinstance(x, np.ndarray) else x for x in columns.values()]
     return [dict(zip(columns, row, strict=True)) for row in zip(*plain, strict=True)]
 
@@ -192,7 +191,6 @@ def run(options: argparse.Namespace) -> None:
 
 
 def simulation_from_flags(options: argparse.Namespace) -> tuple[Job, Simulation]:
-    """Return the robot and the settings of a simulation."""
     settings, drives = read_simulation(options.plant, _PLANT.stated(options))
     for joint, entries in drives.items():
         if named := [entry for entry in entries if isinstance(entry, str)]:

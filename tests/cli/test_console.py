@@ -19,7 +19,7 @@ from helpers.paths import ROOT
 
 from robotid.base.findings import Finding
 from robotid.base.typing import STAGES
-from robotid.cli import compare, doctor, main, paper
+from robotid.cli import compare, doctor, main, paper, payload
 from robotid.cli.console import progress_of, recordings_of
 
 ARM = str(ROOT / "urdf" / "planar_2r.urdf")
@@ -106,6 +106,9 @@ def test_inspect_says_what_it_found_first_and_a_missing_file_once(tmp_path, caps
     printed = capsys.readouterr()
     missing = f"robotid: there is no URDF file '{tmp_path / 'none.urdf'}'\n"
     assert (printed.out, printed.err) == ("", missing)
+    assert main(["inspect", ARM, "--free-flyer"]) == 0
+    printed = capsys.readouterr().out
+    assert printed.endswith(f"\n  robotid inspect {shlex.quote(ARM)} --free-flyer --base\n")
     urdf = tmp_path / "two.urdf"
     urdf.write_text(Path(ARM).read_text().replace('value="1.9"', 'value="-1.9"'))
     assert main(["inspect", str(urdf)]) == 1
@@ -169,7 +172,7 @@ def test_a_stage_is_printed_once_and_files_of_one_name_with_their_folders(capsys
 def test_the_paper_and_base_parameters_are_printed_in_columns(capsys):
     model = {"relative_error": [0.5, 0.25, 0.125], "NA": 7}
     cases = {case: {"linear": {"relative_error": [1.0, 0.1 * k]}}
-             for k, case in enumerate(("disturbed", "noisy", "on program"), 1)}  # fmt: skip
+             for k, case in enumerate(("disturbed", "noisy", "on_program"), 1)}  # fmt: skip
     runs = {"linear": {"converged": 3, "runs": 4}}
     paper._show({"models": {"linear": model}, "trajectories": runs, **cases})
     _, _, row, *_, last = capsys.readouterr().out.splitlines()
@@ -185,6 +188,16 @@ def test_the_paper_and_base_parameters_are_printed_in_columns(capsys):
         assert printed.count(" kg ") == shown
         assert ("  2 more with smaller differences: --verbose" in printed) == (limit == 2)
     assert "\n  p3  1.00  3.000  kg  3.0\n" in printed
+    inertia, errors = np.array([[[1.0, 2.0, 3.0], [2.0, 4.0, 5.0], [3.0, 5.0, 6.0]]] * 2)
+    errors = 0.1 * errors
+    load = {"link": "tool", "mass": 2.0, "mass_std_error": 0.01, "mass_interval": [1.98, 2.02],
+            "com": None, "inertia": inertia, "inertia_std_error": errors, "reasons": {},
+            "inertia_at_link": 10 * inertia}  # fmt: skip
+    payload._print_one_payload(load, None)
+    printed = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["Ixy", "2.00", "+-", "0.20"] in printed
+    assert ["Iyz", "5.00", "+-", "0.50"] in printed
+    assert ["Iyz", "50"] in printed
 
 
 CLOSED = {"no output": ">&-", "no errors": "2>&-", "neither": ">&- 2>&-"}

@@ -51,6 +51,18 @@ def test_a_motion_is_designed_written_and_told(designed):
     assert content["feasible"] is True
 
 
+def test_the_page_of_a_motion_states_the_errors_that_a_preview_of_it_expects(designed, capsys):
+    *_, page = designed
+    words = ["preview", WORDS[1], str(page.with_suffix(".parquet")), *WORDS[2:4], "--json"]
+    assert main(words) == 0
+    entries = json.loads(capsys.readouterr().out)["base_parameters"]
+    shares = np.array([entry["std_error"] / entry["plausible"] for entry in entries])
+    assert (
+        f"Of {len(shares)} base parameters, {(shares < 0.1).sum()} have an expected standard error "
+        f"below 10 % of their plausible range, {(shares > 0.5).sum()} above 50 %."
+    ) in page.read_text()
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

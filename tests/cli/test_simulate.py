@@ -166,7 +166,7 @@ def test_a_robot_that_cannot_be_a_urdf_leaves_no_file(folder, capsys):
     assert not list(folder.glob("never*"))
 
 
-def test_a_limit_and_a_load_do_what_they_say_and_the_truth_states_it(arm, tmp_path):
+def test_a_limit_and_a_load_do_what_they_say_and_the_truth_states_it(arm, tmp_path, capsys):
     """A load at the origin of the last link: by hand, three times its mass in the columns."""
     write_motion(tmp_path / "motion.csv", arm, 3, duration=4.0)
     words = ["--controller", "pd", "--rate", "100", "--seed", "3", "--duration", "3"]
@@ -183,7 +183,10 @@ def test_a_limit_and_a_load_do_what_they_say_and_the_truth_states_it(arm, tmp_pa
     q_ref = SampledMotion(*motion_of(tmp_path / "motion.csv", arm)).evaluate(log.t)[0]
     error = np.abs(log.q - q_ref)
     assert ((log.q - q_ref).max(axis=0) < error.max(axis=0)).any()  # the largest is a lag
+    said = capsys.readouterr().out
     for j, entry in enumerate(truth["following"]):
+        is_slow = entry["range"] < 0.5 * entry["commanded"]
+        assert (f"warning: {arm.joints[j]} moves {entry['range']:.2g}" in said) == is_slow
         assert entry["joint"] == arm.joints[j]
         assert entry["unit"] == "rad"
         assert entry["rms"] == pytest.approx(np.sqrt(np.mean(error[:, j] ** 2)), rel=1e-6)
