@@ -19,13 +19,11 @@ from robotid.diagnosis.logs.channels import AT_REST, ZERO
 from robotid.dynamics.rows import drive_values, friction_directions, friction_speeds, inertial_rows
 from robotid.robot.model import GRAVITY, RobotModel
 
-#: Decrease of the misfit from which another gravity is reported.
-HINT = 0.7
+HINT = 0.7  # Decrease of the misfit from which another gravity is reported
 #: Ratio of unexplained shares from which another reading is certain; as decrease of the misfit.
 MUCH_BETTER = 12.0
 CERTAIN = float(np.log(MUCH_BETTER))
-#: An unexplained share below this is negligible.
-FLOOR = 1e-3
+FLOOR = 1e-3  # An unexplained share below this is negligible
 _MARGIN = 0.15  # [s] rows closer to the end of a segment are not used: the filter has not settled
 _SLOW = 0.05  # largest speed of the unknown sign of friction of a slow joint, over its largest
 _POOR = 0.08  # unexplained share from which other readings of the positions are tested

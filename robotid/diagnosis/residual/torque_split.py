@@ -126,8 +126,7 @@ class JointTorque:
     terms: Mapping[str, Mapping[str, Array]]  # (N,) of each drive parameter, by part and name
     #: Quantities that the residual may depend on: unit and values, (N,), by name.
     quantities: Mapping[str, tuple[str, Array]]
-    #: Share of the squared residual above the filter's cut-off: not correlated over one period of
-    #: it, or from sample to sample without a filter; None if not available.
+    #: Share of the squared residual above the filter's cut-off, or white; None if not available.
     broadband: float | None
     fitted: JointTorque | None = None  # of the fitted recordings; None if it is of them itself
 
@@ -338,11 +337,8 @@ class Dependence:
     unit: str  # of the quantity
     centres: Array  # (B,), mean of the quantity in each bin
     means: Array  # (B,), mean residual in each bin [N m or N]
-    #: (B,), standard error of these means, from their scatter between segments; NaN in bins of
-    #: fewer than three segments.
-    errors: Array
-    #: Share of the residual's variance that the means of other segments explain; None if there are
-    #: too few segments. A negative share means that they explain nothing.
+    errors: Array  # (B,), standard errors of the means between segments; NaN for fewer than three
+    #: Share of the variance that the means of other segments explain; None with too few segments.
     share: float | None
     p_value: float  # p-value of that share [-]
 
