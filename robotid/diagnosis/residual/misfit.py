@@ -139,7 +139,7 @@ class Candidate:
     columns: Callable[[JointMotion], Array]  # (N, c), scaled by that motion or the one it names
     meaning: str  # Description of the term for a finding
     advice: str = ""  # Remedy other than adding it to the model; empty if none
-    #: Unit of the parameter of a revolute and of a prismatic joint; None: the size is its RMS torque
+    #: Unit of the parameter of a revolute and a prismatic joint; None: its size is an RMS torque.
     units: tuple[str, str] | None = None
     revolute_only: bool = False  # Whether only a revolute joint has it
     families: tuple[str, ...] = ()  # of ``FAMILIES`` that contain it, the best advice first

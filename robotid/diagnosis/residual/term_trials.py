@@ -424,7 +424,8 @@ class Trials:
         ends = np.cumsum([Z.shape[2] for Z in columns.values()]).tolist()
         each = zip(columns.items(), ends, strict=True)
         place = {option: list(range(end - Z.shape[2], end)) for (option, Z), end in each}
-        return cls(sample, np.concatenate(list(columns.values()), axis=2)), place
+        none = np.empty((*sample.r.shape, 0))  # there may be no options
+        return cls(sample, np.concatenate([none, *columns.values()], axis=2)), place
 
     @cached_property
     def held_out(self) -> Trial:

@@ -98,19 +98,16 @@ class Rows:
         starts = np.flatnonzero(np.diff(self.recording, prepend=-1))
         if len(starts) == 1:
             return self.t
-        lengths = np.array([np.ptp(self.t[self.recording == k]) for k in range(len(starts))])
-        before = np.concatenate([[0.0], np.cumsum(lengths)[:-1]])
-        return np.asarray(self.t - self.t[starts][self.recording] + before[self.recording])
+        lengths = [np.ptp(part) for part in np.split(self.t, starts[1:])]
+        shift = np.cumsum([0.0, *lengths[:-1]]) - self.t[starts]
+        return np.asarray(self.t + shift[self.recording])
 
     @cached_property
     def pieces(self) -> Array:
         """Piece of each sample, 16 per recording, numbered on, shape (N,), int."""
-        count = _QUARTERS**2
-        pieces = np.empty(len(self.t), dtype=int)
-        for k in range(len(self.recordings)):
-            own = self.recording == k
-            pieces[own] = count * k + np.arange(own.sum()) * count // max(own.sum(), 1)
-        return pieces
+        rows, count = np.bincount(self.recording), _QUARTERS**2
+        place = np.arange(len(self.t)) - np.repeat(np.cumsum(rows) - rows, rows)
+        return np.asarray(count * self.recording + place * count // np.repeat(rows, rows))
 
 
 @dataclass(frozen=True, eq=False)
