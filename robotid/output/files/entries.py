@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -36,17 +36,14 @@ def build_result(
     found: Identification, settings: Mapping[str, Any], outputs: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
     """Return the content of result.json: plain values, all numbers finite."""
+    require_kind(found, Identification, "identification", "a robotid.Identification")
     model, (bodies, drives) = found.model, parameter_entries(found)
     if isinstance(found, TorqueIdentification):
         own = _torque_entries(found, settings)
         beside = found.urdf_with_drives[len(bodies) :].tolist()
         drives = [x | {"with_urdf": value} for x, value in zip(drives, beside, strict=True)]
     else:
-        from robotid.identification.closed_loop.from_commands import PositionIdentification
-
-        require_kind(found, PositionIdentification, "identification", "a robotid.Identification")
-        assert isinstance(found, PositionIdentification)
-        own = loop_entries(found)
+        own = loop_entries(cast("PositionIdentification", found))
     common = {
         "schema_version": SCHEMA_VERSION,
         "robotid": __version__,

@@ -14,8 +14,17 @@ from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
 from robotid.base.settings import require_kind
 from robotid.base.typing import Array
-from robotid.output.files.exports import Exported, Format, Option, Written
-from robotid.output.files.links import WORLD, SimulatedLink, XmlFormat, own_drives, write_model
+from robotid.output.files.exports import (
+    WORLD,
+    Exported,
+    Format,
+    Option,
+    SimulatedLink,
+    Written,
+    XmlFormat,
+    own_drives,
+    write_model,
+)
 from robotid.output.files.result_file import CommandedDrive, Result, limit_of
 from robotid.output.files.urdf import numbers_text
 from robotid.robot.bodies import principal_moments
