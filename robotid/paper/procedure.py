@@ -289,14 +289,12 @@ class _Loop:
             values.append(value)
 
     def _update(self, q: Array, Psi: Array, eta: Array, is_open: NDArray[np.bool_]) -> None:
-        """Apply (24)."""
         sigma = smallest_eigenvalue(self.dynamics.mass_matrix(q, self.P))
         self.skipped = self.skipped + (self.active & (sigma <= 0.0))
         is_open = is_open & self.active
         self.P = recursive_update(self.P, Psi, eta, sigma, is_open, eps2=self.settings.eps2)
 
     def _update_once(self, samples: list[tuple[Array, Array]]) -> None:
-        """Apply (18) to the samples of one run."""
         G, G_star = (np.stack(part, axis=1) for part in zip(*samples, strict=True))
         c, P = self.P.shape[1], self.P.copy()
         for r in np.flatnonzero(self.active):
@@ -307,7 +305,6 @@ class _Loop:
     def _reset_diverged(
         self, number: int, q: Array, v: Array, program: tuple[Array, Array, Array]
     ) -> tuple[Array, Array]:
-        """Reset robots that have diverged to their program."""
         deviation = np.maximum(np.abs(q - program[0]), np.abs(v - program[1])).max(axis=1)
         diverges = ~(deviation < _DIVERGED)  # also with NaN
         self.diverged = np.where(diverges & self.active, number, self.diverged)

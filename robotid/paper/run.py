@@ -231,7 +231,6 @@ def _inertial_vector(arm: RobotModel, study: ModelStudy) -> dict[str, Any]:
 
 
 def _write_replay(arm: RobotModel, study: ModelStudy, target: Path) -> None:
-    """Write the replay of the program motion (28), with the torques of the estimates."""
     t = np.linspace(0.0, DURATION, _SAMPLES)
     q, v, a = PROGRAM.evaluate(t)
     estimates = study.history.estimates[:, 0]
@@ -363,7 +362,6 @@ def _trajectories(content: Mapping[str, Any]) -> str:
 
 
 def _energy(t: Array, gained: Mapping[str, Array]) -> str:
-    """Return the energy gained by each model in free motion."""
     changes = {name: 100 * share for name, share in gained.items()}
     rows = [{"name": name, "change": np.abs(x).max()} for name, x in changes.items()]
     table = listing("Largest change of energy", _ENERGY, rows)
@@ -382,7 +380,6 @@ def _settings(content: Mapping[str, Any]) -> str:
 
 
 def _written(value: object) -> str:
-    """Return the value of a setting as text; numbers of a list with commas."""
     if isinstance(value, list):
         return ", ".join(map(_written, value))
     return f"{value:.4g}" if isinstance(value, float) else str(value)
@@ -413,7 +410,6 @@ def _over_iterations(title: str, label: str, series: Sequence[Series], axis: str
 
 
 def _program_figures() -> str:
-    """Return the program motion (28) of both links."""
     t = np.linspace(0.0, DURATION, 201)
     names = ("position [rad]", "velocity [rad/s]", "acceleration [rad/s²]")
     charts = [
@@ -446,7 +442,6 @@ def _control_figures(studies: Sequence[ModelStudy]) -> str:
 
 
 def _estimate_figures(studies: Sequence[ModelStudy]) -> str:
-    """Return the estimated parameters (24) over the iterations, and the true ones."""
     charts = []
     for study in studies:
         names, P_hat = study.dynamics.names, study.history.estimates[:, 0]
@@ -473,7 +468,6 @@ def _convergence_figures(studies: Sequence[ModelStudy]) -> str:
 
 
 def _disturbed_figures(studies: Sequence[ModelStudy]) -> str:
-    """Return the parameter error under disturbance and noise."""
     return _plots(*(
         _over_iterations(
             f"{study.name}: parameter error with disturbed torque and noisy sensors",

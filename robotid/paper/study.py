@@ -128,14 +128,13 @@ def study_model(
     """Run the paper's simulation (section VI) of one model, in every case."""
     dynamics, P = paper_arm(name)
     plant, cases = partial(dynamics.acceleration, P=P), list(CASES.values())
+    eps2 = np.array([case.eps2 for case in cases])
     history = run_procedure(
         dynamics,
         plant,
         PROGRAM,
         np.tile(P / 2, (len(cases), 1)),
-        settings=LoopSettings(
-            iterations=settings.iterations, eps2=np.array([case.eps2 for case in cases])
-        ),
+        settings=LoopSettings(iterations=settings.iterations, eps2=eps2),
         offset=np.array([case.offset for case in cases]),
         influences=_influences(cases, np.random.default_rng(settings.seed)),
         progress=progress,

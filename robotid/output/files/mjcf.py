@@ -219,9 +219,8 @@ def _add_motion(
     if link.inertial is not None:
         moments, axes = principal_moments(link.inertial)
         x, y, z = np.maximum(moments, 0.0)  # their sums are possible moments in any rounding
-        pose = np.append(
-            link.inertial[1:4] / link.inertial[0], Rotation.from_matrix(axes).as_quat()
-        )
+        com = link.inertial[1:4] / link.inertial[0]
+        pose = np.append(com, Rotation.from_matrix(axes).as_quat())
         mass, inertia = numbers_text(link.inertial[:1]), numbers_text([y + z, z + x, x + y])
         ET.SubElement(body, "inertial", _pose(pose) | {"mass": mass, "diaginertia": inertia})
     if link.floats:
@@ -262,9 +261,8 @@ def _add_drives(
     values: Mapping[str, float],
     servos: _Servos,
 ) -> None:
-    tendons, equality, actuators = (
-        ET.SubElement(top, tag) for tag in ("tendon", "equality", "actuator")
-    )
+    tags = ("tendon", "equality", "actuator")
+    tendons, equality, actuators = (ET.SubElement(top, tag) for tag in tags)
     for coupling in model.layout.couplings:
         at = {"name": coupling.name} | _drive(coupling.name, values)
         tendon = ET.SubElement(tendons, "fixed", at)

@@ -289,7 +289,6 @@ def load_result(path: str | Path) -> Result:
 
 
 def _with_moved_inputs(result: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Return the content of a result with the present paths of its inputs."""
     payloads = result.get("scale_check", {}).get("payloads", [])
     known = [(x["path"], x["sha256"]) for x in result["inputs"]]
     known += [(x["log"], x["sha256"]) for x in payloads]

@@ -152,7 +152,6 @@ def _digest(content: bytes) -> str:
 
 
 def _facts(model: RobotModel, pi: Array, places: Sequence[LinkPlace]) -> dict[str, Any]:
-    """Return the content of a sidecar: options of the model, and parameters of the drives."""
     layout, first = model.layout, model.layout.n_inertial
     units = dict(zip(layout.names[first:], layout.units[first:], strict=True))
     values: dict[str, dict[str, float]] = {drive.name: {} for drive in layout.drives}
@@ -271,7 +270,6 @@ def _angle_edits(document: Document, model: RobotModel) -> list[Edit]:
 
 
 def _is_as_stated(parameters: Array, stated: Inertial | None) -> bool:
-    """Return whether a link's parameters, shape (10,), equal those of its ``<inertial>``."""
     if stated is None:
         return False
     before = inertial_parameters(stated)

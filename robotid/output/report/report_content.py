@@ -103,14 +103,12 @@ def page_of(found: Identification, report: Report, origin: Origin, files: Mappin
     """Return the HTML of the report."""
     rows, verdicts = found.model.row_names, found.verdict.to_dict()["per_joint"]
     definition, after = report.errors
-    tables = "".join(
-        error_table(report.quantity, errors, rows, verdicts) for errors in errors_of(found)
-    )
+    every = errors_of(found)
+    tables = "".join(error_table(report.quantity, x, rows, verdicts) for x in every)
     count = sum(entry["source"] in ("data", "mixed") for entry in report.entries)
     determined = f"{count} of {len(report.entries)} determined by the data, fully or partly"
-    appendix = "".join(
-        folded(key, title, html) for key, (title, html) in report.appendix.items() if html
-    )
+    parts = report.appendix.items()
+    appendix = "".join(folded(key, title, html) for key, (title, html) in parts if html)
     causes = grouped(found.findings, rows)
     findings = "".join(map(_cause, causes)) or "<p>None.</p>\n"
     notes = [cause for cause in causes if cause.severity == "note"]
@@ -380,7 +378,7 @@ def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "")
     counted = [errors for errors, e in zip(validation, found.validation, strict=True)
                if not e.is_refitted] or [fitted]  # fmt: skip
     entries = [entry for part in parameter_entries(found) for entry in part]
-    worst = next(iter(worst_errors(counted)))
+    worst, words = next(iter(worst_errors(counted))), block("report.torque_parameters")
     return Report(
         title=f"{found.model.name}: identified parameters",
         quantity=TORQUE,
@@ -393,9 +391,7 @@ def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "")
         bodies=tables.body_table(found),
         why=why_section(found),
         variation=tables.variation_section(found.variation, _next_errors(found)),
-        parameters=tables.parameter_section(
-            entries, block("report.torque_parameters"), found.on_misfit
-        ),
+        parameters=tables.parameter_section(entries, words, found.on_misfit),
         entries=entries,
         appendix={
             "drives": ("Selected friction terms", _selected_terms(found)),
@@ -525,7 +521,6 @@ def _friction(found: TorqueIdentification) -> str:
 
 
 def _selected_terms(found: TorqueIdentification) -> str:
-    """Return the friction terms selected for each joint, with their shape parameters."""
     rows = []
     for drive in found.drives:
         shapes = [
@@ -665,7 +660,6 @@ def _position_method(found: "PositionIdentification") -> str:
 
 
 def _horizons(runs: Sequence[PositionEvaluation]) -> str:
-    """Return errors over the horizon of the simulation: tables."""
     joints, parts = runs[0].log.joints, list[str]()
     for run in runs:
         whole = {} if run.is_driven else {run.extent.end - run.extent.start: run.rmse}

@@ -587,7 +587,6 @@ def _moved(model: RobotModel, t: Array, q: Array, rate: float) -> dict[str, Any]
 
 
 def _fixed_base(model: RobotModel) -> list[str]:
-    """Return a note for a trunk with several limbs whose motion is unknown."""
     limbs = sum(int(parent) == 0 for parent in list(model.pin_model.parents)[1:])
     if limbs <= 1 or model.free_flyer:
         return []
@@ -715,7 +714,6 @@ def _asset(name: str) -> str:
 
 @cache
 def _script() -> str:
-    """Return the sections of the page's script as one script in its own scope."""
     sections = "".join(_asset(f"{name}.js") for name in _SCRIPTS)
     return f'"use strict";\n(() => {{\n{sections}}})();\n'
 
