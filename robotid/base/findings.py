@@ -69,7 +69,7 @@ def quoted(name: str) -> str:
 def toml_key(name: str) -> str:
     """Return a name as a key of a job file, in quotes if required."""
     is_bare = re.fullmatch(r"[A-Za-z0-9_-]+", name) is not None
-    return name if is_bare else json.dumps(name, ensure_ascii=False)
+    return name if is_bare else quoted(name)
 
 
 def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:

@@ -339,26 +339,24 @@ def _contacts(log: Log, t: Array, settings: SignalSettings) -> tuple[Array, Arra
     for k, flags in enumerate(log.contacts.values()):
         edges = np.diff(flags.astype(np.int8), prepend=0, append=0)
         first, last = np.flatnonzero(edges > 0) - 1, np.flatnonzero(edges < 0)
-        begins = log.t[first.clip(0)] - reach
-        ends = log.t[last.clip(max=len(flags) - 1)] + reach
-        started = np.searchsorted(begins, t, side="right")
-        touching[:, k] = started > np.searchsorted(ends, t, side="left")
-    changing = np.zeros(len(t), dtype=bool)
-    if not settings.cutoff:
-        flags = np.column_stack(list(log.contacts.values()))
-        rows = np.flatnonzero((flags[1:] != flags[:-1]).any(axis=1))
-        started = np.searchsorted(log.t[rows] - reach, t, side="right")
-        changing = started > np.searchsorted(log.t[rows + 1] + reach, t, side="left")
-    return touching, changing
+        touching[:, k] = _are_within(t, log.t, first, last, reach)
+    if settings.cutoff:
+        return touching, np.zeros(len(t), dtype=bool)
+    flags = np.column_stack(list(log.contacts.values()))
+    rows = np.flatnonzero((flags[1:] != flags[:-1]).any(axis=1))
+    return touching, _are_within(t, log.t, rows, rows + 1, reach)
 
 
 def _jumping(stamps: Array, pose: Array, t: Array, settings: SignalSettings) -> Array:
     """Return the times (N,) at which a jump of the pose of the base is in its motion, bool."""
     rows, reach = pose_jumps(stamps, pose)[0], _JUMPS * _time_constant(settings)
-    begins = stamps[(rows - 1 - _BESIDE).clip(0)] - reach
-    ends = stamps[(rows + _BESIDE).clip(max=len(stamps) - 1)] + reach
-    started = np.searchsorted(begins, t, side="right")
-    return started > np.searchsorted(ends, t, side="left")
+    return _are_within(t, stamps, rows - 1 - _BESIDE, rows + _BESIDE, reach)
+
+
+def _are_within(t: Array, stamps: Array, first: Array, last: Array, reach: float) -> Array:
+    """Return which times (N,) lie between the stamps of two rows, enlarged by a time, bool."""
+    started = np.searchsorted(stamps[first.clip(0)] - reach, t, side="right")
+    return started > np.searchsorted(stamps[last.clip(max=len(stamps) - 1)] + reach, t)
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,6 @@ NO_ERROR_OF_MASSES = 3.0
 SCATTERED = 3
 #: A sum of squares that is 0, as a divisor.
 NOTHING = 1e-300
-_STILL = 1e-9  # of the largest squared residual of a segment: below, the joint is at rest in it
 Option = TypeVar("Option", bound=Hashable)
 
 
@@ -165,14 +164,13 @@ def select(
 
 def p_value(before: Array, after: Array, fitted: int) -> float:
     """Return the p-value of a reduction of the squared residuals of segments [-]."""
-    # Student's test of the mean of their shares, each between -1 and 1, over the segments of fitted
-    # logs or over all, whichever p-value is smaller. Segments with the joint at rest do not count.
+    # Student's test of the mean share, in [-1, 1], over fitted segments or all: the smaller one.
     return min(_student(before[:k], after[:k]) for k in {fitted, len(before)})
 
 
 def _student(before: Array, after: Array) -> float:
     """Return the p-value of the mean share; 1 for too few segments."""
-    moves = before > _STILL * before.max(initial=0.0)
+    moves = before > ROUNDING * before.max(initial=0.0)  # else the joint is at rest in the segment
     if moves.sum() < SCATTERED:
         return 1.0
     gain = (before - after)[moves] / np.maximum(before, after)[moves]

@@ -3,7 +3,7 @@
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass
-from functools import cache
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -191,13 +191,12 @@ class Loop(Settings):
 
     def _across(self, rotation: Array) -> Array:
         """Return two directions perpendicular to the axis, fixed in the first link, (2, 3)."""
-        return np.asarray(_perpendicular(tuple(self.axis)) @ rotation.T)
+        return np.asarray(self._perpendicular @ rotation.T)
 
-
-@cache
-def _perpendicular(axis: tuple[float, ...]) -> Array:
-    """Return two directions perpendicular to an axis, shape (2, 3)."""
-    return np.asarray(np.linalg.svd(np.array(axis, dtype=float)[None])[2][1:])
+    @cached_property
+    def _perpendicular(self) -> Array:
+        """Two directions perpendicular to the axis, shape (2, 3)."""
+        return np.asarray(np.linalg.svd(np.array(self.axis, dtype=float)[None])[2][1:])
 
 
 Constraint = Contact | Loop

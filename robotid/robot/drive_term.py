@@ -13,7 +13,7 @@ import numpy as np
 from robotid.base.exceptions import SettingsError
 from robotid.base.settings import is_number
 from robotid.base.typing import Array
-from robotid.robot.urdf_text import LARGEST
+from robotid.robot.tree import LARGEST
 
 #: A law's value and its derivative.
 Slope: TypeAlias = tuple[Array | float, Array | float]

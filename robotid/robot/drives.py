@@ -5,7 +5,7 @@ else in ``TERM_CLASSES`` and ``FAMILIES``. Guarded columns are constant outside 
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Any, ClassVar
@@ -26,7 +26,7 @@ from robotid.robot.drive_term import (
     Slope,
     linear,
 )
-from robotid.robot.urdf_text import LARGEST
+from robotid.robot.tree import LARGEST
 
 _LEAST = 1e-12  # [rad/s or m/s] speed below which the slope of a power is constant
 _POSITIVE = (1.0 / LARGEST, LARGEST)  # bounds of shape parameters that are divisors
@@ -441,15 +441,10 @@ def _table(data_range: DataRange) -> tuple[DriveTerm, ...]:
     )
 
 
-def _harmonics(highest: int) -> Callable[[DataRange], tuple[DriveTerm, ...]]:
-    def make(data_range: DataRange) -> tuple[DriveTerm, ...]:
-        return tuple(
-            Harmonic(data_range=data_range["q"], order=float(k), is_sine=is_sine)
-            for k in range(1, highest + 1)
-            for is_sine in (False, True)
-        )
-
-    return make
+def _harmonics(data_range: DataRange, highest: int) -> tuple[DriveTerm, ...]:
+    orders = [float(k) for k in range(1, highest + 1) for _ in range(2)]
+    sines = (False, True) * highest
+    return tuple(Harmonic(data_range["q"], *both) for both in zip(orders, sines, strict=True))
 
 
 def _by_position(data_range: DataRange) -> tuple[DriveTerm, ...]:
@@ -483,11 +478,12 @@ FAMILIES: dict[str, Family] = {
                # unguarded, since gravity contains them too
                lambda data_range: (Harmonic(), Harmonic(is_sine=True)), needs=0.1),
         Family("harmonics2", "a spring or counterbalance torque that depends on the position",
-               _harmonics(2), needs=0.5, is_automatic=True, code="spring",
+               lambda own: _harmonics(own, 2), needs=0.5, is_automatic=True, code="spring",
                instead=("harmonics1", "spring")),
         Family("harmonics4",
                "a torque that is periodic in the joint's position (cogging, an eccentric gear)",
-               _harmonics(4), needs=0.5, is_automatic=True, code="position_periodic"),
+               lambda own: _harmonics(own, 4), needs=0.5, is_automatic=True,
+               code="position_periodic"),
         Family("asymmetric", "viscous friction that differs by direction",
                lambda data_range: (Asymmetric(),), is_automatic=True, code="friction_shape",
                has_size=True),

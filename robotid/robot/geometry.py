@@ -20,7 +20,7 @@ from robotid.robot.bodies import link_places
 from robotid.robot.examples import example_urdfs
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
-from robotid.robot.urdf_text import LARGEST, numbers
+from robotid.robot.tree import LARGEST, numbers
 
 _FORMATS = (".stl", ".dae", ".obj", ".ply", ".off", ".glb", ".gltf")
 _MOST_BYTES = 2**28  # of a mesh; that of a link has about 2**20
@@ -95,31 +95,27 @@ def find_mesh(name: str, urdf: str | Path) -> Path | None:
 
 def read_surfaces(path: Path) -> tuple[Surface, ...]:
     """Read a mesh: STL, DAE, OBJ, PLY, OFF or glTF."""
-    if path.suffix.lower() not in _FORMATS:
-        raise ValueError(f"{path.name} is not a mesh, wanted {', '.join(_FORMATS)}")
-    try:
-        return _read_surfaces(path)
-    except Exception as error:  # the readers of the formats raise errors of every kind
-        raise ValueError(f"{path.name} cannot be read: {error}") from error
-
-
-def _read_surfaces(path: Path) -> tuple[Surface, ...]:
     import trimesh
 
-    if path.stat().st_size > _MOST_BYTES:
-        raise ValueError(f"the file has more than {_MOST_BYTES // 2**20} MiB")
-    scene = trimesh.load_scene(path)
-    metres = 1.0
-    if path.suffix.lower() == ".dae":  # the one format that states its unit
-        metres = float(trimesh.units.unit_conversion(scene.units or "meters", "meters"))
+    if path.suffix.lower() not in _FORMATS:
+        raise ValueError(f"{path.name} is not a mesh, wanted {', '.join(_FORMATS)}")
     by_colour: dict[tuple[float, ...] | None, list[Surface]] = {}
-    for mesh in scene.dump():
-        if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
-            rgba = _mesh_colour(mesh.visual)
-            surface = Surface(metres * np.asarray(mesh.vertices), np.asarray(mesh.faces), rgba)
-            if not np.abs(surface.vertices).max(initial=0.0) <= LARGEST:
-                raise ValueError(f"a corner is not finite, or beyond {LARGEST:g} m")
-            by_colour.setdefault(rgba, []).append(surface)
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise ValueError(f"the file has more than {_MOST_BYTES // 2**20} MiB")
+        scene = trimesh.load_scene(path)
+        metres = 1.0
+        if path.suffix.lower() == ".dae":  # the one format that states its unit
+            metres = float(trimesh.units.unit_conversion(scene.units or "meters", "meters"))
+        for mesh in scene.dump():
+            if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
+                rgba = _mesh_colour(mesh.visual)
+                surface = Surface(metres * np.asarray(mesh.vertices), np.asarray(mesh.faces), rgba)
+                if not np.abs(surface.vertices).max(initial=0.0) <= LARGEST:
+                    raise ValueError(f"a corner is not finite, or beyond {LARGEST:g} m")
+                by_colour.setdefault(rgba, []).append(surface)
+    except Exception as error:  # the readers of the formats raise errors of every kind
+        raise ValueError(f"{path.name} cannot be read: {error}") from error
     return tuple(joined(surfaces) for surfaces in by_colour.values())
 
 
@@ -186,10 +182,10 @@ def _mesh_colour(visual: Any) -> tuple[float, ...] | None:  # noqa: ANN401
 
 def joined(surfaces: Sequence[Surface]) -> Surface:
     """Return surfaces as one, of the first one's colour."""
-    starts = np.cumsum([0, *(len(s.vertices) for s in surfaces[:-1])])
-    faces = [s.faces + start for s, start in zip(surfaces, starts, strict=True)]
-    vertices = np.vstack([s.vertices for s in surfaces])
-    return Surface(vertices, np.vstack(faces), surfaces[0].rgba)
+    from trimesh.util import append_faces
+
+    vertices, faces = append_faces([s.vertices for s in surfaces], [s.faces for s in surfaces])
+    return Surface(vertices, faces, surfaces[0].rgba)
 
 
 def body_points(model: RobotModel, *, with_visual: bool = False) -> dict[str, Array]:

@@ -20,6 +20,7 @@ from robotid.robot.drive_term import DriveMotion, DriveTerm
 from robotid.robot.drives import DRIVE_TERMS, TERMS
 from robotid.robot.parameters import DYNAMICS, Coupling, ParameterLayout
 from robotid.robot.tree import (
+    LARGEST,
     SMALLEST_LENGTH,
     Joint,
     Tree,
@@ -27,7 +28,6 @@ from robotid.robot.tree import (
     mimic_followers,
     read_tree,
 )
-from robotid.robot.urdf_text import LARGEST
 
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
 _STRONGEST = 100.0  # [m/s^2] with more, accelerations are negligible beside gravity

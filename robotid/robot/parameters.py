@@ -20,7 +20,7 @@ from robotid.base.settings import (
 from robotid.base.typing import Array, frozen
 from robotid.robot.drive_term import DriveTerm
 from robotid.robot.drives import DRIVE_TERMS, TERMS
-from robotid.robot.urdf_text import LARGEST
+from robotid.robot.tree import LARGEST
 
 #: The identified dynamics: all, or those of poses at rest and slow motion.
 DYNAMICS = ("full", "static")

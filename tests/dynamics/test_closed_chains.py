@@ -8,6 +8,7 @@ import pytest
 
 from robotid.base.exceptions import DataError, ModelError
 from robotid.base.text import seconds
+from robotid.cli.identify import identify
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
@@ -19,7 +20,6 @@ from robotid.dynamics.constraint_rows import (
 )
 from robotid.dynamics.prepared_logs import closed_log
 from robotid.dynamics.torque import joint_torque_regressor, random_regressor
-from robotid.identification.pipeline import identify
 from robotid.robot.closure import Chains
 from robotid.robot.constraints import Contact, Loop
 from robotid.robot.drives import TERMS, Spring

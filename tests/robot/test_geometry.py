@@ -17,7 +17,7 @@ from robotid.robot.geometry import (
 )
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
-from robotid.robot.urdf_text import parse_urdf
+from robotid.robot.tree import parse_urdf
 
 URDF = """<robot name="arm">
 <link name="base"/>

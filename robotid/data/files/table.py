@@ -208,21 +208,18 @@ def with_standard_names(table: Table, where: str, kind: str, source: LogSource) 
         note = f"the topic {source.topic!r} is not used: {kind} have none"
         table = replace(table, notes=(*table.notes, note))
     names = {_CLOCK: "time"} if _CLOCK in table.names and "time" not in table.names else {}
-    return table.with_names(names | (topics[_topic(topics, where, source)] if topics else {}))
-
-
-def _topic(topics: Mapping[str, Mapping[str, str]], where: str, source: LogSource) -> str:
-    """Return the stated topic, or the only one (with efforts, if any topic has efforts)."""
-    if source.topic is None:
-        moved = [x for x, names in topics.items() if any("effort_" in y for y in names.values())]
+    if topics and source.topic is None:  # the only one, with efforts if any topic has efforts
+        moved = [x for x, own in topics.items() if any("effort_" in y for y in own.values())]
         words = "its columns have names as <topic>/<joint>/position"
-        return choose(where, moved or list(topics), "topics of joint states", words)
-    if source.topic not in topics:
+        names |= topics[choose(where, moved or list(topics), "topics of joint states", words)]
+    elif topics and source.topic not in topics:
         raise DataError(
             f"{where} has no topic {source.topic!r}; topics: {listed(topics)}"
-            f"{suggestion(source.topic, topics)}"
+            f"{suggestion(str(source.topic), topics)}"
         )
-    return source.topic
+    elif topics:
+        names |= topics[str(source.topic)]
+    return table.with_names(names)
 
 
 def with_stated_names(table: Table, where: str, names: Sequence[str]) -> Table:

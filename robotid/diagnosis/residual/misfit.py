@@ -281,8 +281,6 @@ def couplings(motion: JointMotion) -> tuple[Candidate, ...]:
 
 def setting_of(misfit: Misfit, fit: Fit) -> str:
     """Return the entry of a job file that adds a term to the model; empty if there is none."""
-    # It is a line of [drives] that includes the present terms of the joint, or a table
-    # [[coupling]].
     joint, other = misfit.joint, misfit.term.coupled
     if other:
         ratios = f"{toml_key(joint)} = 1.0, {toml_key(other)} = {misfit.term.ratio}"
@@ -306,8 +304,8 @@ def with_entries(fit: Fit, joint: str, entries: Sequence[str | DriveTerm]) -> st
 
 def settled(before: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Finding]:
     """Return the findings before and of the fit, without hypotheses that a term explains."""
-    # The doctor's model has no springs: it attributes a torque that depends on the position to
-    # wrong masses, or to nothing. The term that explains it is then a warning, even if it is small.
+    # The doctor attributes a torque that depends on the position to wrong masses. The term that
+    # explains it is then a warning, even if it is small.
     rest, terms = list(before), []
     for term in of_fit:
         hypotheses = [f for f in rest if _explains(term, f)]

@@ -360,8 +360,7 @@ class Trial:
 
     def estimate(self, which: Sequence[int], fitted: int) -> tuple[Array, Array]:
         """Return the parameters of some columns and their covariance, shapes (k,) and (k, k)."""
-        # Of a fit to all samples. The covariance is that of clusters: from the scatter of the
-        # scores between segments, valid for noise of any colour.
+        # From the scatter of the scores between segments: valid for noise of any colour.
         theta, S = self.parameters(which), self.S[which][:, which]
         H = self.H[:fitted, which]
         scores = H[:, :, -1] - H[:, :, which] @ theta  # (K, k)
@@ -449,7 +448,6 @@ class Trials:
         excludes: Callable[[Option, Option], bool] = operator.eq,
     ) -> Iterator[Accepted[Option]]:
         """Yield the options that explain the residual, one after the other, by their columns."""
-        # An option that was selected excludes others: itself, unless stated otherwise.
         held_out, fitted, columns = self.held_out, self.sample.fitted, list[int]()
         alone = before = held_out.left([])
         of_fitted, of_validation = (float(x.sum()) for x in np.split(alone, [fitted]))

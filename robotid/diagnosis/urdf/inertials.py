@@ -17,8 +17,7 @@ from robotid.robot.geometry import body_points, kinematic_lengths
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.prior import REASONS, assumed_masses
-from robotid.robot.tree import Inertial, Joint, Tree
-from robotid.robot.urdf_text import exact_angle, numbers
+from robotid.robot.tree import Inertial, Joint, Tree, exact_angle, numbers
 
 #: Findings that take the URDF's masses as evidence.
 _OF_MASSES = (
@@ -26,9 +25,7 @@ _OF_MASSES = (
 )  # fmt: skip
 _DENSEST, _LIGHTEST = 20_000.0, 10.0  # [kg/m^3] over the box: about solid tungsten, and foam
 _MARGIN = 0.1  # of the box's diagonal, by which a centre of mass may lie outside
-_LONGEST = np.sqrt(
-    5.0
-)  # ellipsoid of a body with half of its mass on each of two sides, over the box
+_LONGEST = np.sqrt(5.0)  # ellipsoid of a body with its mass on two sides, over the box
 _SLENDER = 1.6  # ellipsoid over the length that the kinematics give; a uniform rod has 1.29
 _THIN = 0.01  # [m] least side of a box, so that thin sheets have a volume
 _SMALL = 1e-3  # share of the robot's mass below which a fault of a body is only a note
@@ -185,8 +182,7 @@ def _carrying(tree: Tree) -> set[str]:
 
 def audit_links(model: RobotModel) -> Iterator[Finding]:
     """Yield implausible inertials of a robot."""
-    # A body is a moving link with all links that are fixed to it. The collision geometry is used,
-    # or the visual one; a body whose geometry cannot be read is not checked.
+    # A body is a moving link with all links fixed to it; without readable geometry it is skipped.
     yield from _templates(model)
     points = body_points(model)
     yield from audit_bodies(model, model.standard_parameters(), points)
@@ -257,8 +253,7 @@ def _against_geometry(body: str, J: Array, points: Array) -> Iterator[Finding]:
 
 def _against_kinematics(body: str, J: Array, length: float, longest: float) -> Iterator[Finding]:
     """Yield the parameters of a body without geometry that are impossible for its length [m]."""
-    # A body may be wide where its joints are close: warnings need more than the longest of all
-    # bodies allows.
+    # Wide bodies have close joints: warnings need more than the longest of all bodies allows.
     of_link, centre = {"subject": f"link {body}", "link": body}, J[:3, 3] / J[3, 3]
     distance = float(np.linalg.norm(centre))
     if distance > max(length, longest):

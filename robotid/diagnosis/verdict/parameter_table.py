@@ -103,7 +103,6 @@ class CentralParameters:
 
 def central_parameters(fit: Fit) -> CentralParameters:
     """Return the parameters of each body about its centre of mass."""
-    # Standard errors are those of the standard parameters, propagated to first order.
     n, size = len(fit.model.layout.bodies), fit.model.layout.n_inertial
     pi, before = (x[:size].reshape(n, 10) for x in (fit.standard, fit.prior))
     error = fit.standard_error[:size]

@@ -246,9 +246,7 @@ def uses_of_torques(
     scale_check: ScaleCheck | None,
 ) -> dict[str, str]:
     """Return what a result with predicted torques can be used for: "yes" or "no", and why."""
-    # Torque feed-forward needs the predicted torque of its joints. Inertials in a simulation need
-    # physical consistency and the torque scale, too. The mass of a payload is that of the gravity
-    # torque: it needs the joints that gravity loads, and the torque scale.
+    # Inertials need consistency and the scale; a payload joints that gravity loads, and the scale.
     predicted, gravity = _predicted(joints), () if scale_check is None else scale_check.gravity
     loaded = {joint: status for joint, status in joints.items() if joint in gravity}
     if log_errors:
@@ -505,10 +503,8 @@ def rejected(
     findings: Sequence[Finding], validation: Mapping[str, Metrics], scale_check: ScaleCheck
 ) -> list[Finding]:
     """Return findings; hypotheses that a good prediction of unseen motion rejects become notes."""
-    # Wrong masses, a wrong direction of gravity or an unexplained torque are rejected if the error
-    # of these torques is below 5 % on every validation log. Another unit of the torque, or a torque
-    # without gravity, is rejected if the identified gravity torque is also within a factor of two
-    # of the URDF's.
+    # If the error of these torques is below 5 % on every validation log. Another unit, or a torque
+    # without gravity, also needs an identified gravity torque within a factor of two of the URDF's.
     errors: dict[str, float] = {}
     is_fitted = any(one.code == "repeated_motion" for one in findings)
     for metrics in () if is_fitted else validation.values():

@@ -16,7 +16,7 @@ from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.drive_terms import DriveChoice
 from robotid.estimation.fitting.evaluation import LEFT_OUT, Evaluated, Evaluation
-from robotid.estimation.fitting.fitted import SOURCES, Identified, next_errors, typical_friction
+from robotid.estimation.fitting.fitted import SOURCES, Identified, next_errors
 from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.output.files.ranges import covariance_entry, parameter_ranges
@@ -172,7 +172,7 @@ def _friction(found: TorqueIdentification, drive: DriveChoice) -> dict[str, Any]
     return {
         "terms": [*own, *drive.families],
         **choice,
-        **({"curve": typical_friction(found, drive.joint).to_dict()} if moves else {}),
+        **({"curve": found.friction(drive.joint).to_dict()} if moves else {}),
         "on_misfit": [name for name in found.on_misfit if name.startswith(f"{drive.joint}.")],
         "tried": [{"terms": [*own, *tried["families"]], **tried} for tried in choice["tried"]],
     }

@@ -14,6 +14,7 @@ from helpers.paths import ROOT
 
 from robotid.base.findings import Finding
 from robotid.cli.doctor import doctor
+from robotid.cli.identify import identify
 from robotid.cli.job import job_from_settings, read_job
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.residual import misfit
@@ -29,7 +30,6 @@ from robotid.diagnosis.residual.term_trials import RIDGE, Trials, take_sample
 from robotid.diagnosis.verdict.verdict import warnings_of
 from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.identification.pipeline import identify
 from robotid.robot.drives import AUTO
 from robotid.robot.model import RobotModel
 

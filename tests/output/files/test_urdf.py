@@ -11,8 +11,7 @@ from robotid.dynamics.torque import random_regressor
 from robotid.output.files.urdf import load_identified, write_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling, pseudo_inertia
-from robotid.robot.tree import read_tree
-from robotid.robot.urdf_text import read_with_yourdfpy
+from robotid.robot.tree import read_tree, read_with_yourdfpy
 
 # three joints; a tool on a fixed joint, a frame without inertial, and much that is no dynamics
 RICH = """\ufeff<?xml version="1.0" encoding="utf-8"?>
