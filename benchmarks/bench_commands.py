@@ -40,6 +40,7 @@ from helpers import mujoco_plant
 from mujoco import rollout
 
 from robotid.base.exceptions import SettingsError
+from robotid.cli.identify import identify
 from robotid.cli.job import read_job
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
@@ -52,7 +53,6 @@ from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.loop_simulator import LoopSimulator, free_body_parameters
 from robotid.identification.closed_loop.position_errors import run_open_loop
 from robotid.identification.closed_loop.stages import stated_loops
-from robotid.identification.pipeline import identify
 from robotid.output.files.result_file import CommandedDrive, loops_of
 from robotid.robot.drives import AUTO
 from robotid.robot.examples import example_urdf

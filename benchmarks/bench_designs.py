@@ -28,8 +28,15 @@ FINE = 30  # ten times 3 times the grid of the first rounds
 
 def design_row(name, task, best, seeds):
     """Return how one start went: the median over some seeds, margins of the first."""
-    found = [task.design(np.random.default_rng(seed), starts=1) for seed in range(seeds)]
-    passed = [next((t for t, value in f.history if value < best), np.inf) for f in found]
+    found, passed = [], []
+    for seed in range(seeds):
+        began, values = time.monotonic(), []
+
+        def progress(_, value, began=began, values=values):
+            values.append((time.monotonic() - began, value))
+
+        found.append(task.design(np.random.default_rng(seed), starts=1, progress=progress))
+        passed.append(next((t for t, value in values if value < best), np.inf))
     seconds = [f.seconds for f in found]
     settled = sum(f.is_converged for f in found)
     fine = replace(task, finer=FINE)

@@ -23,7 +23,7 @@ from scipy.signal import lfilter
 from robotid.cli.job import read_job
 from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.estimation.fitting.fitted import friction_curve
-from robotid.identification.pipeline import identify
+from robotid.cli.identify import identify
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process

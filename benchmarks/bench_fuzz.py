@@ -94,13 +94,13 @@ def work(kind, count, number):
     """Try inputs of a kind, and print a word for each, and for each that broke."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     signal.signal(signal.SIGALRM, late)
-    make, arguments, run = KINDS[kind]
+    strategy, run = KINDS[kind]
     seen = set()
 
     @seed(number)
     @settings(max_examples=count, database=None, deadline=None, phases=[Phase.generate],
               suppress_health_check=list(HealthCheck))  # fmt: skip
-    @given(make(*arguments))
+    @given(strategy)
     def try_one(example):
         print("inputs", flush=True)
         signal.alarm(LONGEST)

@@ -40,7 +40,7 @@ from helpers.paths import JOBS
 from walkers import G1, ICUB, TALOS, forces, planned
 
 from robotid.base.exceptions import NotConvergedError, RankDeficientError
-from robotid.cli.identify import run_job
+from robotid.cli.identify import identify, run_job
 from robotid.cli.job import read_job
 from robotid.data.base_motion import BaseMotion
 from robotid.data.log import Log
@@ -51,7 +51,6 @@ from robotid.dynamics.factors import compress
 from robotid.dynamics.prepared_logs import base_problem
 from robotid.estimation.fitting.estimator_settings import ConsistentSettings
 from robotid.estimation.fitting.recorded import hold_log
-from robotid.identification.pipeline import identify
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

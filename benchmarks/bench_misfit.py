@@ -23,10 +23,10 @@ import numpy as np
 from helpers.corruptions import robot
 from helpers.misfits import EFFECTS, log_with
 
+from robotid.cli.identify import identify
 from robotid.cli.job import read_job
 from robotid.diagnosis.residual.misfit import find_misfits
 from robotid.diagnosis.residual.term_trials import take_sample
-from robotid.identification.pipeline import identify
 
 JOINTS = 4  # of the UR5, the first ones, which get a term: a wrist carries no load to speak of
 RATE = 100.0  # [Hz]

@@ -27,7 +27,7 @@ import scipy.linalg
 import scipy.signal
 
 from robotid.cli.job import read_job
-from robotid.identification.pipeline import identify
+from robotid.cli.identify import identify
 from robotid.design.previews import TorqueNoise
 from robotid.design.previews import preview
 from robotid.data.log import Log

@@ -22,13 +22,13 @@ import pinocchio as pin
 from setting import machine
 
 from robotid.base.exceptions import RobotIdError
+from robotid.cli.identify import identify
 from robotid.cli.job import read_job
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.evaluation import pool
-from robotid.identification.pipeline import identify
 from robotid.robot.bodies import link_places
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -28,7 +28,6 @@ from robotid.dynamics.torque import (
     InstantRegressor,
     build_problem,
     joint_torque_regressor,
-    mass_regressor,
 )
 from robotid.estimation.estimators import PRX, RLS, Kalman, NormalisedGradient, fold
 from robotid.estimation.estimators.recursive import column_scale
@@ -85,14 +84,13 @@ def timed(step, samples):
     return np.median(warm), np.percentile(warm, 99)
 
 
-def ours(bench, estimator, with_mass=False):
+def ours(bench, estimator):
     columns, weight = bench.mapping.independent, np.ones(bench.n)
     regressor, state = InstantRegressor(bench.model, columns), [estimator.init(bench.c)]
 
     def step(k):
         Y = regressor(bench.q[k], bench.v[k], bench.a[k])
-        D = mass_regressor(bench.model, bench.q[k : k + 1])[0][..., columns] if with_mass else None
-        state[0] = estimator.update(state[0], Sample(Y, bench.tau[k], weight, D))
+        state[0] = estimator.update(state[0], Sample(Y, bench.tau[k], weight))
 
     return step
 
@@ -180,10 +178,6 @@ def steps(samples):
         "Kalman, walk and gate": (ours(bench, Kalman(bench.sigma, **prior, walk=1e-6)), "Kalman"),
         "PRX exact": (ours(bench, PRX(bench.sigma, average=False, **prx)), "PRX"),
         "PRX exact, averaged": (ours(bench, PRX(bench.sigma, **prx)), "PRX"),
-        "PRX printed": (
-            ours(bench, PRX(bench.sigma, bench.start, step="printed", average=False), True),
-            "PRX",
-        ),
         "normalised gradient": (ours(bench, NormalisedGradient(bench.sigma, **prx)), None),
     }
     identifier = OnlineIdentifier(bench.model)
@@ -245,26 +239,21 @@ def exact_steps():
             )
             columns = mapping.independent
             W = joint_torque_regressor(model, q, v, a)[:, columns]
-            D = mass_regressor(model, q)[..., columns]
             block = (W, W @ beta, np.ones(len(W)))
-            problem = problem_of(block, D, mapping, model)
-            for step in ("exact", "printed"):
-                misses = []
-                for passes in (1, 2, 5):
-                    order = np.random.default_rng(0)
-                    estimator = PRX(
-                        np.ones(6), 1.3 * beta, step=step, average=False,
-                        passes=passes, rng=order,
-                    )  # fmt: skip
-                    theta = estimator.fit(problem).theta
-                    misses.append(np.linalg.norm(theta - beta) / np.linalg.norm(beta))
-                name = f"{label}, {kind}, {step}"
-                print(f"{name:42} " + " ".join(f"{miss:8.1e}" for miss in misses))
+            problem = problem_of(block, mapping, model)
+            misses = []
+            for passes in (1, 2, 5):
+                order = np.random.default_rng(0)
+                estimator = PRX(np.ones(6), 1.3 * beta, average=False, passes=passes, rng=order)
+                theta = estimator.fit(problem).theta
+                misses.append(np.linalg.norm(theta - beta) / np.linalg.norm(beta))
+            name = f"{label}, {kind}"
+            print(f"{name:42} " + " ".join(f"{miss:8.1e}" for miss in misses))
 
 
-def problem_of(block, D, mapping, model):
+def problem_of(block, mapping, model):
     support = model.support[:, mapping.independent]
-    return Problem(lambda: iter([block]), mapping.base_names, 6, support, lambda: iter([D]))
+    return Problem(lambda: iter([block]), mapping.base_names, 6, support)
 
 
 def payload():

@@ -31,7 +31,7 @@ import pinocchio as pin
 from scipy.linalg import block_diag
 from scipy.special import ndtr
 
-from robotid.cli.identify import run_job
+from robotid.cli.identify import identify, run_job
 from robotid.cli.job import LogEntry, job_from_settings, read_job
 from robotid.cli.logs import survey_logs
 from robotid.data.log import Log
@@ -46,7 +46,7 @@ from robotid.estimation.variation.groups import Group, RunsOf, runs_of, sums_of
 from robotid.estimation.variation.spread import Runs, SpreadModel, covariance_of, scores_to_values
 from robotid.estimation.variation.variation import SCORES, Variation, _parameters, vary
 from robotid.identification.closed_loop.from_commands import loop_runs
-from robotid.identification.pipeline import identify, with_drives
+from robotid.identification.pipeline import with_drives
 from robotid.robot.drives import wanted_families
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

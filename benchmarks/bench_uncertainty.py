@@ -32,7 +32,7 @@ import scipy.signal
 from robotid.data.log import Log
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.estimation.fitting import fit
-from robotid.identification.pipeline import identify
+from robotid.cli.identify import identify
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

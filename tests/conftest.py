@@ -16,10 +16,10 @@ from helpers.browsing import launch
 from helpers.paths import IN_CI, ROOT
 from helpers.synthetic import exact_log, truth
 
+from robotid.cli.identify import identify
 from robotid.data.files.read import read_log, write_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.identification.pipeline import identify
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

@@ -26,7 +26,7 @@ EXAMPLES = {
 @pytest.mark.filterwarnings("ignore:Generating overly large repr")  # a whole result.json
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_input_gives_a_traceback(kind):
-    make, arguments, run = KINDS[kind]
+    strategy, run = KINDS[kind]
 
     @settings(
         max_examples=EXAMPLES.get(kind, 8),
@@ -36,7 +36,7 @@ def test_no_input_gives_a_traceback(kind):
         phases=[Phase.generate],
         suppress_health_check=list(HealthCheck),
     )
-    @given(make(*arguments))
+    @given(strategy)
     def try_one(example):
         with tempfile.TemporaryDirectory() as folder:
             run(example, Path(folder))

@@ -8,7 +8,7 @@ class RobotIdError(Exception):
     """Base class of all errors of robotid; they can be sent between processes."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restore, (type(self), self.args, vars(self))
+        return type(self).__new__, (type(self), *self.args), vars(self)  # not by its __init__
 
 
 class ModelError(RobotIdError, ValueError):
@@ -63,12 +63,3 @@ class MissingDependencyError(RobotIdError, ImportError):
             f"{purpose} needs {package}, which is not installed: pip install '.[{extra}]' in a "
             f"checkout of robotid, or pip install 'robotid[{extra}]' where an index has it"
         )
-
-
-def _restore(
-    kind: type[RobotIdError], args: tuple[Any, ...], facts: dict[str, Any]
-) -> RobotIdError:
-    """Return an error with its message and attributes, without the arguments of its class."""
-    error = kind.__new__(kind, *args)
-    vars(error).update(facts)
-    return error

@@ -140,15 +140,11 @@ def _marked(path: Path) -> None:
 
 
 @contextmanager
-def written_whole(target: str | Path, inputs: Iterable[str | Path | None] = ()) -> Iterator[Path]:
-    """Provide a hidden name beside a file; what is written there then replaces the file.
-
-    After an error the target is unchanged, and no hidden file remains. A device, a pipe or
-    ``/dev/stdout`` is not replaced: it receives the content when that is complete.
-    """
+def written_whole(target: str | Path) -> Iterator[Path]:
+    """Provide a hidden name beside a file; what is written there then replaces the file, or not."""
     path = Path(target)
-    check_file(path, inputs)
-    if _is_stream(path):
+    check_file(path)
+    if _is_stream(path):  # it receives the content when that is complete
         with tempfile.TemporaryDirectory(prefix="robotid-") as folder:
             yield Path(folder, path.name)
             try:

@@ -69,7 +69,7 @@ def quoted(name: str) -> str:
 def toml_key(name: str) -> str:
     """Return a name as a key of a job file, in quotes if required."""
     is_bare = re.fullmatch(r"[A-Za-z0-9_-]+", name) is not None
-    return name if is_bare else json.dumps(name, ensure_ascii=False)
+    return name if is_bare else quoted(name)
 
 
 def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
@@ -151,11 +151,8 @@ def _filled(values: Sequence[str | float], spec: str, how: str) -> str:
 
 
 def _alike(findings: Sequence[Finding]) -> list[list[Finding]]:
-    """Return the findings whose messages differ only in names and numbers, in groups.
-
-    A user types one value, so they are apart if settings are. Logs with other joints are apart,
-    unless one of them has all of the joints: then its own sentence is true.
-    """
+    """Return the findings whose messages differ only in names and numbers, in groups."""
+    # settings and logs with other joints are apart, unless one log has all of the joints
     groups: dict[tuple[object, ...], list[Finding]] = {}
     for k, finding in enumerate(findings):
         other = tuple(sorted(x for x in finding.words.items() if x[0] not in _NAMES))

@@ -1,8 +1,4 @@
-"""Settings, declared once: the field of a table states meaning, permitted values and file format.
-
-The keys of a job file, the checks of their values, the help of flags, the page of the job file and
-the settings in result.json are derived from these fields.
-"""
+"""Settings: keys, checks, help, pages and results derive from the fields that declare them."""
 
 import difflib
 import math
@@ -145,10 +141,10 @@ class Settings:
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Self:
-        """Return the settings of a table of a job file.
+        """Return the settings of a table of a job file with keys and types of the ``schema``.
 
         Args:
-            table: The table, with keys and types of the ``schema``.
+            table: The table.
         """
         given = {}
         for f, key, (*tables, last) in cls.entries():

@@ -17,18 +17,9 @@ def code_versions() -> dict[str, str]:
 
 def versions() -> dict[str, str]:
     """Return all versions: ``code_versions`` and the platform."""
-    return code_versions() | {"platform": _platform()}
-
-
-def _platform() -> str:
-    """Return the text of platform.platform(), which would start a process on Linux."""
     import platform
 
-    system = platform.uname()
-    if system.system != "Linux":
-        return platform.platform()
-    libc = "".join(platform.libc_ver())
-    return "-".join([system.system, system.release, system.machine, "with", libc]).rstrip("-")
+    return code_versions() | {"platform": platform.platform()}
 
 
 @cache  # each call reads the metadata of a package

@@ -178,7 +178,6 @@ def _content(
         "feasible": all((m["margin"] or 0.0) >= 0.0 for m in margins.values()),
         "kind": settings.kind, "share": settings.share, "duration": design.duration,
         "points": settings.points, "limits": margins,
-        "history": [list(entry) for entry in design.history],
     }  # fmt: skip
     if designer.name == "widest":
         content["widest"] = [names[k] for k in designer.widest[::-1]]

@@ -56,9 +56,8 @@ from robotid.estimation.fitting.estimator_settings import EstimatorSettings, Sim
 from robotid.estimation.fitting.evaluation import Evaluated
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.work_plan import WorkPlan
-from robotid.identification import pipeline
 from robotid.identification.closed_loop.loop_settings import LoopSettings
-from robotid.identification.pipeline import conclude, logs_of, robot_of
+from robotid.identification.pipeline import conclude, in_memory, logs_of, robot_of
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.identification.summary import (
     error_lines,
@@ -142,35 +141,38 @@ def identify(
     require_flag(doctor, "doctor")
     check_ignored(ignore)
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
-    if not isinstance(choice, SimulationSettings):
-        if controller is not None:
-            raise SettingsError(
-                f"controller is given, but the estimator is {choice.name!r}, wanted 'simulation'; "
-                "remove controller, or set estimator='simulation'"
-            )
-        return pipeline.identify(
-            model, logs, validation=validation, signals=signals, estimator=choice,
-            friction=friction, doctor=doctor, ignore=ignore, progress=progress,
-        )  # fmt: skip
-    from robotid.identification.closed_loop.from_commands import identify_loops
-    from robotid.identification.closed_loop.stages import STAGES
-
+    is_simulated = isinstance(choice, SimulationSettings)
+    if controller is not None and not is_simulated:
+        raise SettingsError(
+            f"controller is given, but the estimator is {choice.name!r}, wanted 'simulation'; "
+            "remove controller, or set estimator='simulation'"
+        )
     require_kind(controller, (Mapping, type(None)), "controller", "a table of its settings")
     loop, settings = LoopSettings.from_dict(controller or {}), signals or SignalSettings()
-    report_stage(progress, "reading logs", STAGES)
+    report_stage(progress, "reading logs", _stages(choice))
     model = robot_of(model, logs)
     wanted = wanted_families(friction, model.joints).values()
-    if any(wanted) or len({names is None for names in wanted}) > 1:
+    if is_simulated and (any(wanted) or len({names is None for names in wanted}) > 1):
         raise SettingsError(
             "friction is stated by joint or with families, but simulation selects the terms of all "
             "joints, or of none; wanted 'auto' or 'viscous+coulomb'. State terms in the model"
         )
-    fitted, held_out = (logs_of(model, some, needed_of(loop)) for some in (logs, validation))
-    return identify_loops(
-        model, fitted, held_out, loop, choice, signals=settings, chooses=None in wanted,
-        examined=diagnose(model, fitted, held_out, settings) if doctor else (), ignore=ignore,
-        progress=progress or ignore_progress,
-    )  # fmt: skip
+    needs = needed_of(loop) if is_simulated else "torque"
+    fitted, held_out = (logs_of(model, some, needs) for some in (logs, validation))
+    if not fitted:
+        raise DataError("no log was given; at least one is needed to identify anything")
+    if isinstance(choice, SimulationSettings):
+        from robotid.identification.closed_loop.from_commands import identify_loops
+
+        return identify_loops(
+            model, fitted, held_out, loop, choice, signals=settings, chooses=None in wanted,
+            examined=diagnose(model, fitted, held_out, settings) if doctor else (), ignore=ignore,
+            progress=progress or ignore_progress,
+        )  # fmt: skip
+    recordings = in_memory(model, settings, fitted, held_out)
+    report_stage(progress, "checking logs")
+    findings = diagnose(model, fitted, held_out, settings) if doctor else ()
+    return conclude(recordings, choice, findings, ignore, friction=friction, progress=progress)
 
 
 def run_job(
@@ -180,7 +182,7 @@ def run_job(
     plan, target, model = plan or WorkPlan(job.workers or 1), Path(folder), job.model()
     check_folder(target, ["result.json", *_names(model)])
     identification = identify_job(job, model, plan)
-    report_stage(plan.progress, "writing", _stages(job))
+    report_stage(plan.progress, "writing", _stages(job.estimator))
     return _write(identification, _job_of(identification), target, source=source)
 
 
@@ -315,7 +317,7 @@ def identify_job(
 ) -> Identification:
     """Identify from a job's logs; nothing is written."""
     check_ignored(job.ignore)
-    report_stage(plan.progress, "reading logs", _stages(job))
+    report_stage(plan.progress, "reading logs", _stages(job.estimator))
     if isinstance(job.estimator, SimulationSettings):
         return _identify_loops(job, model, plan.progress)
     groups = job.identification, job.validation
@@ -349,9 +351,9 @@ def identify_job(
     )
 
 
-def _stages(job: Job) -> Sequence[str]:
+def _stages(choice: EstimatorSettings) -> Sequence[str]:
     """Return the stages of a job; the modules of a simulation are imported only for one."""
-    if not isinstance(job.estimator, SimulationSettings):
+    if not isinstance(choice, SimulationSettings):
         return STAGES
     from robotid.identification.closed_loop import stages
 

@@ -116,13 +116,7 @@ class BaseMotion:
 
 @dataclass(frozen=True)
 class BaseColumns:
-    """The columns of a floating base and of contacts that are read from a file.
-
-    The pose is ``base_x`` to ``base_z`` [m] and ``base_qx`` to ``base_qw``, or ``base_roll``,
-    ``base_pitch``, ``base_yaw`` [rad]. Velocities ``base_vx`` to ``base_wz`` and accelerations
-    ``base_ax`` to ``base_alz`` are optional. An IMU's ``imu_wx`` to ``imu_az`` replace these; its
-    orientation is that of the base or ``imu_qx`` to ``imu_qw``, and the position may be missing.
-    """
+    """The columns of a floating base (or of its IMU) and of contacts that are read from a file."""
 
     floats: bool = False  # whether the motion of a floating base is read
     contacts: tuple[str, ...] = ()  # links whose contacts are read, ``contact_<link>``, 1 or 0
@@ -297,9 +291,7 @@ def base_state(
 ) -> tuple[Array, Array, Array]:
     """Return pose (N, 7), twist (N, 6) and acceleration (N, 6) of a base as of Pinocchio.
 
-    What was not recorded is differentiated: with the axes R of the base, v = R^T dx/dt and
-    w = 2 (q* dq/dt), the vector part of the product of quaternions.
-    t (N,) [s], pose (N, 7) [m, -], twist (N, 6), acceleration (N, 6).
+    What was not recorded is differentiated: v = R^T dx/dt, w the vector part of 2 q* dq/dt.
     """
     quaternion = pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
     pose = np.hstack([pose[:, :3], quaternion])
@@ -318,8 +310,7 @@ def base_state(
 def pose_jumps(t: Array, pose: Array) -> tuple[Array, Array, Array]:
     """Return the jumps of a pose (N, 7) from one row to the next: rows, lengths [m] and angles.
 
-    A step is compared with the mean of the steps before and after it, and their difference with
-    those of 32 rows on each side. A change of the speed, as by an impact, is no jump.
+    The difference of a step from its neighbours' mean is compared with those of 32 rows beside it.
     """
     dt, sizes = np.diff(t), np.zeros((2, len(t)))
     if len(dt) < 3:
@@ -418,11 +409,9 @@ def bias_at_rest(parts: Sequence[tuple[Array, Array, Array]]) -> tuple[Array, st
 def orientation_of_imu(t: Array, values: Array, gravity: Array) -> Array:
     """Return the orientation of a base from an IMU alone, qx qy qz qw, shape (N, 4).
 
-    The angular velocity is integrated. With the axes that result, the mean specific force in some
-    seconds is opposite to gravity, for the velocity of a robot hardly changes in them: this
-    corrects the tilt. The heading starts at 0. See Mahony, Hamel, Pflimlin (2008), Nonlinear
-    Complementary Filters on the Special Orthogonal Group; here without delay, for the whole log is
-    known. t (N,) [s], values (N, 6), gravity (3,) [m/s^2].
+    The angular velocity is integrated; the mean specific force of some seconds, opposite to
+    gravity, corrects the tilt (Mahony, Hamel, Pflimlin 2008, without delay). The heading starts at
+    0. t (N,) [s], values (N, 6), gravity (3,) [m/s^2].
     """
     parts = np.split(np.arange(len(t)), np.flatnonzero(np.diff(t) > _BREAK) + 1)
     return np.concatenate([_levelled(t[k], values[k], -gravity) for k in parts])
@@ -476,10 +465,9 @@ def _product(p: Array, q: Array) -> Array:
 def inertial_state(
     t: Array, velocity: Array, down: Array, values: Array, frame: ImuFrame
 ) -> tuple[Array, Array]:
-    """Return twist (N, 6) and its time derivative (N, 6) of a base with an IMU, in base axes.
+    """Return twist and its time derivative (N, 6): dv/dt = f - alpha x r - w x (w x r) + g - w x v.
 
-    With the lever r of the IMU, its specific force f without bias and gravity g, the specific force
-    at the origin is f - alpha x r - w x (w x r), and dv/dt = that + g - w x v.
+    f is the specific force of an IMU without its offset, r its lever; all with the base's axes.
     """
     w, f, r = values[:, :3], values[:, 3:], frame.lever
     f = f if frame.offset is None else f - frame.offset

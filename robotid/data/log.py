@@ -1,7 +1,4 @@
-"""Motion of a robot as arrays: `Log`, the recording, and `Trajectory`, the input of a fit.
-
-Files are read and written by `robotid.data.files.read`.
-"""
+"""Motion of a robot as arrays: `Log`, the recording, and `Trajectory`, the input of a fit."""
 
 import difflib
 import tempfile
@@ -407,11 +404,18 @@ def require_finite(
 
 
 def require_increasing(t: Array, where: str, first: int = 0) -> None:
-    """Reject time stamps that repeat or decrease; the error names the first: t (N,) [s]."""
+    """Reject stamps that repeat, decrease, or have tiny steps; names the first: t (N,) [s]."""
     back = np.flatnonzero(np.diff(t) <= 0)
     if len(back) == 0:
-        _check_rate(t, where)
-        return
+        step = float(t[-1] - t[0]) / (len(t) - 1) if len(t) > 1 else np.inf
+        if step >= _SHORTEST:
+            return
+        raise DataError(
+            f"{where}: {len(t)} rows lie within {float(t[-1] - t[0]):.3g} s, so the mean time step "
+            f"is {step:.3g} s, wanted at least {_SHORTEST:g} s; correct the time stamps or their "
+            "unit",
+            code="time_unit",
+        )
     k = int(back[0]) + 1
     row, now, before = first + k, _stamp(t[k]), _stamp(t[k - 1])
     if t[k] == t[k - 1]:
@@ -425,20 +429,6 @@ def require_increasing(t: Array, where: str, first: int = 0) -> None:
         "sort the rows, or correct the recording",
         code="stamp_order",
     )
-
-
-def _check_rate(t: Array, where: str) -> None:
-    """Reject time stamps with implausibly small steps."""
-    if len(t) < 2:
-        return
-    step = float(t[-1] - t[0]) / (len(t) - 1)
-    if step < _SHORTEST:
-        raise DataError(
-            f"{where}: {len(t)} rows lie within {float(t[-1] - t[0]):.3g} s, so the mean time step "
-            f"is {step:.3g} s, wanted at least {_SHORTEST:g} s; correct the time stamps or their "
-            "unit",
-            code="time_unit",
-        )
 
 
 def _stamp(t: float) -> str:

@@ -240,10 +240,7 @@ def _dump_matrix(value: Any) -> Any:  # noqa: ANN401
 
 @dataclass(frozen=True)
 class Transmission(Settings):
-    """Motors and the joints that they drive.
-
-    With the matrix T, w = T v, q = T^-1 q_m + offset and tau = T^T (efficiency tau_m).
-    """
+    """Motors and joints: w = T v, q = T^-1 q_m + offset and tau = T^T (efficiency tau_m)."""
 
     _table: ClassVar[str] = "transmission"
 
@@ -314,11 +311,7 @@ class Transmission(Settings):
 
     @property
     def shared(self) -> dict[str, tuple[tuple[str, float], ...]]:
-        """Ratios of the motors that several joints move, over the largest ratio of the motor.
-
-        The key is the joint whose drive parameters are those of the motor; the value is pairs of
-        joint and ratio.
-        """
+        """Joints and ratios, over the largest, of each shared motor, by the joint in its place."""
         is_coupled = np.abs(self.T) > 0
         alone = is_coupled.sum(axis=1) == 1
         has_own = is_coupled[alone].any(axis=0)  # joints with a motor of their own

@@ -1,10 +1,4 @@
-"""From a raw log to smooth motion: resample, filter, differentiate, trim. Log -> Trajectory.
-
-Signals are not filtered or differentiated across a gap or from one log to another. Every step can
-be switched off: with ``cutoff=None`` and no ``rate`` the rows are those of the log. A segment
-without gaps is processed as a whole or part by part: a part is resampled and filtered together with
-neighbouring rows, which are removed afterwards.
-"""
+"""From a raw log to smooth motion: resample, filter, differentiate, trim. Log -> Trajectory."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -178,11 +172,8 @@ def process_segments(
     own: slice = _ALL,
     speeds: Array | None = None,
 ) -> Trajectory:
-    """Return the smooth motion of segments without gaps, or of a part of them: speeds (c, n).
-
-    The result for a part equals that for the whole, if the log has the rows of its segments within
-    ``filter_reach`` of the part.
-    """
+    """Return the smooth motion of segments without gaps, or of a part of them: speeds (c, n)."""
+    # a part equals the whole if the log has the rows of its segments within ``filter_reach``
     is_sharp = settings.cutoff is None and settings.friction_band == 0
     ratios = np.empty((0, len(log.joints))) if speeds is None or is_sharp else speeds
     if len(log.t) > KEPT or first or own.indices(len(log.t)) != (0, len(log.t), 1):
@@ -232,11 +223,7 @@ def _process(part: _Part, segments: Sequence[Segment]) -> Trajectory:
 
 
 def filter_reach(settings: SignalSettings) -> float:
-    """Return the settling time of the filter, before and after a row [s].
-
-    It is more than twice the settling time of one filter: the sign of a smooth speed depends on
-    the longest time of stiction, and is filtered a second time.
-    """
+    """Return the settling time of filter, stiction and filter, before and after a row [s]."""
     delay = max(abs(settings.torque_delay), abs(settings.velocity_delay))
     if settings.cutoff is None or settings.rate is None:
         return delay
@@ -343,38 +330,33 @@ def _channels(
 
 
 def _contacts(log: Log, t: Array, settings: SignalSettings) -> tuple[Array, Array]:
-    """Return which links may touch the ground at times (N, k), and where that changes (N,), bool.
-
-    A contact begins and ends between two rows of the log. The filter of the torque spreads its
-    force before and after it: there, too, the force is unknown. What is neglected adds up over
-    steps to an error of the mass. Without a filter the acceleration jumps between the two rows.
-    """
+    """Return which links may touch the ground at times (N, k), and where that changes (N,)."""
+    # the filter spreads the force of a contact before and after it: what is neglected is an error
+    # of the mass; without a filter the acceleration jumps between two rows
     reach = _SPREAD * _time_constant(settings)
     reach += 1e-9 * float(log.t[-1] - log.t[0])
     touching = np.zeros((len(t), len(log.contacts)), dtype=bool)
     for k, flags in enumerate(log.contacts.values()):
         edges = np.diff(flags.astype(np.int8), prepend=0, append=0)
         first, last = np.flatnonzero(edges > 0) - 1, np.flatnonzero(edges < 0)
-        begins = log.t[first.clip(0)] - reach
-        ends = log.t[last.clip(max=len(flags) - 1)] + reach
-        started = np.searchsorted(begins, t, side="right")
-        touching[:, k] = started > np.searchsorted(ends, t, side="left")
-    changing = np.zeros(len(t), dtype=bool)
-    if not settings.cutoff:
-        flags = np.column_stack(list(log.contacts.values()))
-        rows = np.flatnonzero((flags[1:] != flags[:-1]).any(axis=1))
-        started = np.searchsorted(log.t[rows] - reach, t, side="right")
-        changing = started > np.searchsorted(log.t[rows + 1] + reach, t, side="left")
-    return touching, changing
+        touching[:, k] = _are_within(t, log.t, first, last, reach)
+    if settings.cutoff:
+        return touching, np.zeros(len(t), dtype=bool)
+    flags = np.column_stack(list(log.contacts.values()))
+    rows = np.flatnonzero((flags[1:] != flags[:-1]).any(axis=1))
+    return touching, _are_within(t, log.t, rows, rows + 1, reach)
 
 
 def _jumping(stamps: Array, pose: Array, t: Array, settings: SignalSettings) -> Array:
     """Return the times (N,) at which a jump of the pose of the base is in its motion, bool."""
     rows, reach = pose_jumps(stamps, pose)[0], _JUMPS * _time_constant(settings)
-    begins = stamps[(rows - 1 - _BESIDE).clip(0)] - reach
-    ends = stamps[(rows + _BESIDE).clip(max=len(stamps) - 1)] + reach
-    started = np.searchsorted(begins, t, side="right")
-    return started > np.searchsorted(ends, t, side="left")
+    return _are_within(t, stamps, rows - 1 - _BESIDE, rows + _BESIDE, reach)
+
+
+def _are_within(t: Array, stamps: Array, first: Array, last: Array, reach: float) -> Array:
+    """Return which times (N,) lie between the stamps of two rows, enlarged by a time, bool."""
+    started = np.searchsorted(stamps[first.clip(0)] - reach, t, side="right")
+    return started > np.searchsorted(stamps[last.clip(max=len(stamps) - 1)] + reach, t)
 
 
 @dataclass(frozen=True)
@@ -447,13 +429,9 @@ def _resample(t: Array, values: Array, grid: Array) -> Array:
 def acting_directions(t: Array, w: Array, band: float, longest: float) -> Array:
     """Return the direction of Coulomb friction at each instant, between -1 and 1, shape (N, c).
 
-    It is the sign of the speed. In stiction, a drive stops abruptly and moves again later: its
-    friction balances the applied torque, from one bound to the other, while the filtered speed
-    oscillates about zero. There the direction changes linearly in time from the sign before to the
-    sign after. A drive was in stiction if it was in the band longer than the slopes at the edges of
-    the band indicate: by a factor of two if it reverses, of four if it does not. See Karnopp
-    (1985), Computer simulation of stick-slip friction in mechanical dynamic systems. t (N,) [s], w
-    (N, c) [rad/s].
+    It is the sign of the speed, in stiction (Karnopp 1985) linear in time from the sign before to
+    the sign after. A drive was in stiction if it was in the band longer than the slopes at the
+    edges of the band indicate, by a factor. t (N,) [s], w (N, c) [rad/s].
     """
     directions = np.where(np.abs(w) < _REST, 0.0, np.sign(w))
     for x, direction in zip(w.T, directions.T, strict=True):
@@ -481,12 +459,10 @@ def _crossing(t: Array, x: Array, level: float) -> tuple[float, float]:
 def standing_motion(
     log: Log, max_gap: float, least: Array, fastest: Array, hardest: Array
 ) -> tuple[Trajectory, Array]:
-    """Return the means (K,) of a log over short blocks, and which of them are at rest.
+    """Return the means (K,) of a log over blocks of 0.25 s, and which of them are at rest.
 
-    A block is a quarter of a second, or a row if the time steps are longer. Blocks in which a joint
-    is too fast, or is accelerated too much, are left out. Consecutive blocks at rest are one
-    sample. There is no filter: the speed is the slope of the positions over the block, and 0 for a
-    single row.
+    Blocks in which a joint is too fast, or is accelerated too much, are left out; consecutive ones
+    at rest are one sample. The speed is the slope of the positions over the block.
     """
     of_block, segment = _blocks(log.t, max_gap)
     first = np.flatnonzero(np.diff(of_block, prepend=-1))
@@ -560,11 +536,9 @@ def butterworth_poles(order: int, cutoff: float, rate: float) -> Array:
 
 
 def zero_phase(x: Array, order: int, cutoff: float, rate: float, pad: int) -> Array:
-    """Return signals after a Butterworth filter forwards and backwards, shape (N, ...).
+    """Return signals x (N, ...) after a Butterworth filter forwards and backwards.
 
-    The initial state of each pass is the steady state for the first value; both ends are extended
-    by point reflection of the signal (Gustafsson 1996 compares such initial states).
-    x (N, ...).
+    Each pass starts from the steady state; both ends are extended by point reflection.
     """
     if not x.size:
         return x  # LAPACK would write beyond an empty array
@@ -586,10 +560,9 @@ def zero_phase(x: Array, order: int, cutoff: float, rate: float, pad: int) -> Ar
 
 
 def _filter(x: Array, pole: complex, work: Array) -> tuple[Array, Array]:
-    """Return filtered signals, shape (k, N), by one pole or a conjugate pair, from state 0.
+    """Return filtered signals (k, N), by one pole or a conjugate pair, and a free array of memory.
 
     With zeros at half the rate: y + a y' = g (x + x'), or y + a y' + b y'' = g (x + 2 x' + x'').
-    The signals and another array of their shape are overwritten; the second one returned is free.
     """
     is_real = abs(pole.imag) < 1e-12 * abs(pole)
     a = np.array([1.0, -pole.real] if is_real else [1.0, -2 * pole.real, abs(pole) ** 2])
@@ -605,12 +578,7 @@ def _filter(x: Array, pole: complex, work: Array) -> tuple[Array, Array]:
 def local_polynomial(
     x: Array, width: int, degree: int, *, derivative: int = 0, step: float = 1.0
 ) -> Array:
-    """Return signals smoothed by polynomials through the rows around each row, shape (N, ...).
-
-    At the ends the polynomial of the first and of the last ``width`` rows is used (Savitzky, Golay
-    1964).
-    x (N, ...).
-    """
+    """Return signals x (N, ...) smoothed by local polynomials (Savitzky, Golay 1964)."""
     half = width // 2
     offsets = np.arange(-half, half + 1)
     fit = np.linalg.pinv(np.vander(offsets, degree + 1, increasing=True))  # (degree + 1, width)

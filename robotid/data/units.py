@@ -1,7 +1,4 @@
-"""Units and measured velocities of a log, checked against its positions.
-
-Units are stated by the user, or checked; never guessed.
-"""
+"""Units and measured velocities of a log: stated, or checked against its positions."""
 
 from collections.abc import Callable, Collection, Sequence
 from functools import wraps
@@ -41,11 +38,7 @@ ResultT = TypeVar("ResultT")
 def check_units(
     log: Log, units: LogUnits, prismatic: Collection[str] = (), turning: Collection[str] = ()
 ) -> None:
-    """Reject a log whose numbers look like another unit than SI, unless the unit is stated.
-
-    The measured velocity is compared with the position over short segments: the factor between
-    the integral of dq and the change of q is 1 if both are in SI units.
-    """
+    """Reject a log whose numbers look like another unit than SI, unless the unit is stated."""
     is_revolute = np.array([name not in prismatic for name in log.joints])
     factor = _velocity_factor(log)  # (n,), NaN for a joint that does not determine it
     if units.time is None:
@@ -248,8 +241,7 @@ def is_timely(log: Log, stated: float = 0.0) -> bool:
 def velocity_lags(log: Log) -> tuple[float, Array]:
     """Return the delay of measured velocities after the slopes of positions, and of each joint [s].
 
-    It minimises their distance, on a uniform grid in segments without gaps, refined by a parabola.
-    It is 0 if the joints are at rest.
+    It minimises their distance on a uniform grid, refined by a parabola; 0 if the joints rest.
     """
     v = _measured(log)
     step = float(np.median(np.diff(log.t)))

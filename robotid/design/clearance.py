@@ -114,7 +114,6 @@ class Clearance:
         least: float = 0.02,
         floor: float | None = None,
         boxes: Sequence[Box] = (),
-        seed: int = 0,
     ) -> None:
         import coal
 
@@ -140,7 +139,7 @@ class Clearance:
         # which joints move which body, (m + 1, m), bool; the last row is at rest
         self._supports = np.vstack([is_below, np.zeros(len(is_below), dtype=bool)])
         self.pairs = self._possible_pairs()
-        self._classify(np.random.default_rng(seed))
+        self._classify(np.random.default_rng(0))
 
     def _possible_pairs(self) -> Array:
         """Return pairs that can move against each other: not links that a joint joins."""
@@ -251,13 +250,10 @@ class Clearance:
         return Nearness(bound, pairs, samples, gradient)
 
     def nearest(self, motion: Motion, duration: float) -> Contact | None:
-        """Return the smallest margin of a motion to a collision, at all times, not only at samples.
+        """Return the smallest margin of a motion to a collision, at all times.
 
-        An interval of time is halved until, by the largest motion of the joints between two hulls
-        within it, their margin cannot be more than 0.5 mm below the smallest one found elsewhere.
-
-        References:
-            Schwarzer, Saha, Latombe (2005), Adaptive dynamic collision checking for robots.
+        Intervals are halved until, by the largest motion within one, no margin is 0.5 mm below the
+        smallest one elsewhere (Schwarzer, Saha, Latombe 2005, Adaptive dynamic collision checking).
         """
         smallest, required = SOFT, self.required[:, None]  # smallest: margin so far
         lowest, nearest = smallest, None

@@ -176,7 +176,6 @@ class Design:
     seconds: float = 0.0  # computing time [s]
     starts: int = 0  # number of completed starts
     is_converged: bool = False  # whether the best of them has converged
-    history: tuple[tuple[float, float], ...] = ()  # computing time [s], criterion of better ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +213,6 @@ class Designer:
         name: str = "D",
         clearance: Clearance | None = None,
         noise: Mapping[str, float] | None = None,
-        correlation: float = CORRELATION,
         run: Run | None = None,
     ) -> "Designer":
         """Return a designer with the assumptions of a preview on friction and noise."""
@@ -222,7 +220,7 @@ class Designer:
         size, speed = largest_torques(model, largest_gravity(model)), limits.sizes[1]
         pi = assumed_parameters(model, size, speed) if run is None else run.standard
         found = None if run is None else run.noise(mapping.K)
-        density = assumed_noise(model, size, noise or {}, correlation, found).density(0.0)
+        density = assumed_noise(model, size, noise or {}, CORRELATION, found).density(0.0)
         typical = _TYPICAL * np.array([size, speed, speed * 2 * np.pi / basis.shortest])
         spread = base_spread(mapping.K, prior_spread(model, typical**2, 1))
         given = None
@@ -248,18 +246,15 @@ class Designer:
     ) -> Design:
         """Return the best motion, checked on a grid 15 times as fine as the first one."""
         began, best = time.monotonic(), np.inf
-        history: list[tuple[float, float]] = []
         followed: list[State] = []
 
         def is_over() -> bool:
-            return bool(history) and time.monotonic() - began > seconds
+            return best < np.inf and time.monotonic() - began > seconds
 
         def follow(designer: Designer, state: State, settled: float) -> State:
             nonlocal best
             for state in designer._search(state, settled, is_over):  # noqa: B020
-                if state.objective < best:
-                    best = state.objective
-                    history.append((time.monotonic() - began, best))
+                best = min(best, state.objective)
                 if progress is not None:
                     progress(len(followed), best)
             return state
@@ -281,7 +276,6 @@ class Designer:
             seconds=time.monotonic() - began,
             starts=len(followed),
             is_converged=polished.is_settled,
-            history=tuple(history),
         )
 
     def checked(self, C: Array) -> Design:
@@ -417,11 +411,7 @@ class Designer:
         return self.judged(self.matrix(self.information.rows(*state)))[0]
 
     def _lagrangian(self, C: Array, multipliers: Multipliers) -> tuple[float, Array]:
-        """Return the augmented Lagrangian of a motion and its gradient, shape (h, n).
-
-        References:
-            Nocedal, Wright (2006), Numerical Optimization, section 17.4.
-        """
+        """Return augmented Lagrangian and its gradient, (h, n); Nocedal, Wright (2006), 17.4."""
         D, (rows, torque, used) = self._functions, self._followed(C)
         value, by_F = self.judged(self.matrix(rows))
         cost, pushed = multipliers.of_limits(used)
@@ -464,10 +454,7 @@ class Designer:
         return self._feasible(C, 1.0 - SPARE)
 
     def _feasible(self, C: Array, most: float) -> Array:
-        """Return the largest share of a motion about its middle that satisfies the limits, (h, n).
-
-        Each joint is scaled to its own limits of position to jerk first; then all are scaled alike.
-        """
+        """Return the largest feasible share of a motion, (h, n): each joint, then all alike."""
         limits = self.limits
         free = most * limits.sizes[0] - np.abs(C[0] - limits.middle)
         moving = np.abs(self._functions[:, :, 1:] @ C[1:]).max(axis=1)  # (4, n)

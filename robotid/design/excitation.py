@@ -16,6 +16,7 @@ from robotid.base.settings import SIZE, Range, Settings, setting
 from robotid.base.text import yaml_name
 from robotid.base.typing import Array
 from robotid.data.files.read import check_suffix, write_columns
+from robotid.design.information import CRITERIA
 from robotid.dynamics.simulation.motions import Motion
 
 #: Kinds of motion from posture to posture.
@@ -50,9 +51,9 @@ class MotionSettings(Settings):
     criterion: str | None = setting(
         None,
         "optimality criterion: D (determinant of the information), A (mean variance), E (smallest "
-        "eigenvalue), condition (number), or widest (the quarter of the parameters with the "
-        "largest variance in RESULT); default: widest with --given, else D",
-        among=("D", "A", "E", "condition", "widest"),
+        "eigenvalue), or widest (the quarter of the parameters with the largest variance in "
+        "RESULT); default: widest with --given, else D",
+        among=CRITERIA,
     )
     share: float = setting(
         0.9, "usable share of the URDF's limits", within=_from(1e-3, 1.0, " of the limits")
@@ -106,12 +107,7 @@ def check_motion_file(target: str | Path) -> None:
 def write_motion(
     motion: Motion, joints: Sequence[str], duration: float, rate: float, target: str | Path
 ) -> Path:
-    """Write a motion: .csv or .parquet, .yaml for ROS 2, .script for Universal Robots.
-
-    A table has the columns time, q_, dq_ and ddq_ of each joint [s, rad or m], like a log. A .yaml
-    file is a trajectory_msgs/JointTrajectory. A .script is a URScript function that moves to the
-    first posture and then calls servoj every 8 ms.
-    """
+    """Write a motion: .csv or .parquet as a log, .yaml for ROS 2, .script for Universal Robots."""
     path = Path(target)
     if not 0 < rate < np.inf:
         raise SettingsError(f"rate is {rate:g}, wanted a positive number of rows per second")

@@ -15,7 +15,7 @@ from robotid.robot.drive_term import DriveMotion, DriveTerm
 from robotid.robot.model import RobotModel
 
 #: The optimality criteria.
-CRITERIA = ("D", "A", "E", "condition", "widest")
+CRITERIA = ("D", "A", "E", "widest")
 #: Of the finite differences of drive columns, in their argument's scale.
 _STEP = np.finfo(float).eps ** (1 / 3)
 _REVERSAL = 0.01  # [rad/s or m/s] speed over which the sign of friction changes
@@ -124,10 +124,7 @@ class MotionInformation:
 
     @cached_property
     def chains(self) -> Array:
-        """Share of each joint (column) in the torque at rest of each (row), shape (n, n).
-
-        It is the same for all joints on the chain through it, 0 for others.
-        """
+        """Share of each joint (column) in each one's torque at rest, equal on a chain, (n, n)."""
         ratios = self.model.velocity_map != 0.0  # (m, n)
         chain = np.eye(len(ratios), dtype=bool)
         for i in range(len(ratios)):
@@ -203,11 +200,7 @@ class MotionInformation:
 
 
 def criterion(name: str, F: Array, widest: Array | None = None) -> tuple[float, Array]:
-    """Return a criterion of an information matrix, the smaller the better, and its gradient.
-
-    References:
-        Pukelsheim (2006), Optimal Design of Experiments, chapter 6.
-    """
+    """Return a criterion of information and its gradient: Pukelsheim (2006), chapter 6."""
     if name not in CRITERIA:
         raise SettingsError(f"criterion is {name!r}, wanted one of {', '.join(CRITERIA)}")
     size = len(F)
@@ -231,8 +224,5 @@ def criterion(name: str, F: Array, widest: Array | None = None) -> tuple[float, 
         C = (vectors[some] / values) @ vectors.T  # (k, b) of F^-1
         variance = C[np.arange(len(some)), some]
         return float(np.log(variance).mean()), -(C.T / variance) @ C / len(some)
-    low, high = vectors[:, 0], vectors[:, -1]
-    by_low = -np.outer(low, low) / values[0]
-    if name == "E":
-        return -float(np.log(values[0])), by_low
-    return float(np.log(values[-1] / values[0])), np.outer(high, high) / values[-1] + by_low
+    low = vectors[:, 0]
+    return -float(np.log(values[0])), -np.outer(low, low) / values[0]

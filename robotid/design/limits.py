@@ -158,10 +158,7 @@ class Postures:
         return np.asarray((used.max(axis=(0, 2)) <= 1.0) & (margins >= 0.0).all(axis=0))
 
     def _at_rest(self, q: Array) -> tuple[Array, Array]:
-        """Return used shares of limits of postures, (6, N, n), and margins, (pairs, N) [m].
-
-        The margins have the reserve of a design.
-        """
+        """Return used shares of limits (6, N, n), and margins with reserve (pairs, N) [m]."""
         still = np.zeros_like(q)
         rows = self.information.rows(q, still, still)
         used = np.abs(self.limits.used(q, still, still, still, self.information.torque(rows)))

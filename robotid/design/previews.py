@@ -174,11 +174,9 @@ class Run:
         return merge(self.segments)
 
     def noise(self, K: Array) -> TorqueNoise:
-        """Return the noise of its residuals, with the correlation given by the scatter of scores.
-
-        The scatter of a joint's score depends on the direction. The geometric mean over the
-        parameters, weighted by the joint's share of their variance, is used.
-        """
+        """Return the noise of its residuals; the scatter of scores gives the correlation."""
+        # the scatter of a joint's score depends on the direction: the geometric mean over the
+        # parameters, weighted by the joint's share of their variance
         factors, beta = self.factors, K @ self.standard
         sigma = np.sqrt(factors.residual_squares(beta) / np.maximum(factors.rows, 1))
         sigma = np.maximum(sigma, _EXACT * max(float(sigma.max()), _EXACT))
@@ -480,11 +478,8 @@ def _with_torque(log: SurveyedLog) -> SurveyedLog:
 def _errors(
     information: _Information, known: Known, choice: EstimatorSettings, typical: tuple[float, float]
 ) -> tuple[Estimate, Estimate]:
-    """Return the expected estimate and that of WLS, both at the prior.
-
-    The bounds of a consistent fit are left out: it is not known in advance which are active. The
-    weight of its prior, unless it is stated, and the plausible weight are the typical ones.
-    """
+    """Return the expected estimate and that of WLS, both at the prior, without active bounds."""
+    # the weight of the prior, unless it is stated, and the plausible weight are the typical ones
     factors, K = information.factors, known.mapping.K
     plain, alike = (
         _least_squares(information, known, sigma)

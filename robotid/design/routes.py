@@ -123,14 +123,8 @@ def _sweeps(designer: Designer, posture: Array, free: Array, speeds: Sequence[fl
 
 
 def design_stands(designer: Designer, rng: np.random.Generator, count: int = 20) -> Design:
-    """Return a motion that rests at the postures whose gravity torques give the most information.
-
-    The postures are chosen one by one from random ones: each adds the most to log det of the
-    information of those before. The motion goes from each to the nearest that is not visited yet.
-
-    References:
-        Fedorov (1972), Theory of Optimal Experiments.
-    """
+    """Return a motion that rests at postures whose gravity torques give the most information."""
+    # one by one, each adds the most to log det (Fedorov 1972, Theory of Optimal Experiments)
     q = designer.postures.resting(rng, POSES)
     still = np.zeros_like(q)
     rows = designer.information.rows(q, still, still)

@@ -1,12 +1,9 @@
 """The compressed problem: one triangular factor per joint, by sequential QR.
 
-Least squares, weighted least squares and convex fits need only the triangular factor R_j of each
-joint's rows, with R_j^T R_j = [W_j tau_j]^T [W_j tau_j]. The factors of two logs merge into the
-factor of both. A reduction of a segment of a log has its factors and other sums over its samples.
-
-Rows are folded into a factor in place by LAPACK's dtpqrt, which computes the QR of [R; rows]
-without using the zeros of R. It is called through the address of SciPy's own LAPACK, which copies
-nothing and releases the interpreter's lock; if that is not available, through SciPy's wrapper.
+Fits need only the triangular factor R_j of each joint's rows, with R_j^T R_j =
+[W_j tau_j]^T [W_j tau_j]; those of two logs merge. Rows are folded in place by LAPACK's dtpqrt, the
+QR of [R; rows] without the zeros of R, through the address of SciPy's own LAPACK: it copies nothing
+and releases the interpreter's lock. If that is not available, SciPy's wrapper is used.
 """
 
 import ctypes
@@ -24,7 +21,6 @@ import scipy.linalg.lapack
 
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
-from robotid.data.log import Trajectory
 from robotid.dynamics.problem import Problem, RowSource
 
 ItemT = TypeVar("ItemT")
@@ -142,25 +138,21 @@ class Reduction:
     squares: Array  # sums of tau^2, v^2 and a^2 over all samples, used or not, shape (3, n_rows)
     samples: int  # number of these samples
 
-    @classmethod
-    def of(
-        cls, problem: Problem, trajectory: Trajectory, *, threads: int | None = None
-    ) -> "Reduction":
-        """Reduce the problem of one trajectory."""
-        return cls(compress(problem, threads=threads), trajectory.squares, len(trajectory.t))
-
 
 def compress(problem: Problem, *, threads: int | None = None) -> Factors:
-    """Fold a problem into its factors, block by block.
+    """Fold a problem into its factors, in parts of a fixed size, whatever the number of threads.
 
-    Long problems are cut into parts of a fixed number of samples, whose factors are merged in
-    order: the result does not depend on the number of threads. See Demmel, Grigori, Hoemmen, Langou
-    (2012), Communication-optimal parallel and sequential QR.
+    See Demmel, Grigori, Hoemmen, Langou (2012), Communication-optimal parallel and sequential QR.
     """
     columns = [np.flatnonzero(row) for row in problem.support]
     triangles = [Triangle(len(own) + 1) for own in columns]
+    for source in problem.sources:
+        places = _places(source, columns)
+        for part in _folded(source, _PART, _PART, threads):
+            for triangle, place, R_j in zip(triangles, places, part, strict=True):
+                triangle.fold_triangle(R_j, place)
     if problem.sources:
-        rows = _fold_sources(triangles, columns, problem.sources, threads)
+        rows = np.sum([source.rows(0, source.samples) for source in problem.sources], axis=0)
     else:
         rows = _fold_blocks(triangles, columns, problem)
     return _factors_of([triangle.R for triangle in triangles], columns, rows, problem)
@@ -362,21 +354,6 @@ def _fold_blocks(
             scaled *= root[used, j, None]
             triangles[j].fold(scaled)
     return rows
-
-
-def _fold_sources(
-    triangles: Sequence[Triangle],
-    columns: Sequence[Array],
-    sources: Sequence[RowSource],
-    threads: int | None,
-) -> Array:
-    """Fold each source into the factors, part by part; return the number of rows per joint."""
-    for source in sources:
-        places = _places(source, columns)
-        for part in _folded(source, _PART, _PART, threads):
-            for triangle, place, R_j in zip(triangles, places, part, strict=True):
-                triangle.fold_triangle(R_j, place)
-    return np.asarray(np.sum([source.rows(0, source.samples) for source in sources], axis=0))
 
 
 def _places(source: RowSource, columns: Sequence[Array]) -> list[Array]:

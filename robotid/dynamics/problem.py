@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, repeat
+from itertools import chain
 from typing import TypeAlias
 
 import numpy as np
@@ -24,7 +24,6 @@ class Sample:
     Y: Array  # regressor, shape (n, c)
     tau: Array  # measured torque, shape (n,) [N m or N]
     weight: Array  # row weights, shape (n,); 0 excludes a row
-    mass_regressor: Array | None = None  # regressor of the mass matrix, shape (n, n, c), or None
 
 
 class RowSource(ABC):
@@ -66,8 +65,6 @@ class Problem:
     names: tuple[str, ...]  # names of the c columns
     n_joints: int  # number n of rows per sample
     support: Array  # shape (n, c), bool: False where row j is zero for every motion
-    # starts a new pass over the regressors of the mass matrices of each block, (k, n, n, c)
-    mass_stream: Callable[[], Iterator[Array]] | None = None
     sources: tuple[RowSource, ...] = ()  # the same rows joint by joint; empty: only blocks
     is_projected: bool = False  # whether constraint forces were eliminated, as of ``Factors``
 
@@ -83,10 +80,8 @@ class Problem:
     def samples(self) -> Iterator[Sample]:
         """Yield the problem sample by sample, for recursive estimators."""
         n, c = self.n_joints, len(self.names)
-        masses = repeat(None) if self.mass_stream is None else self.mass_stream()
-        for (W, tau, weight), mass in zip(self.blocks(), masses, strict=False):
-            by_joint = W.reshape(-1, n, c), tau.reshape(-1, n), weight.reshape(-1, n)
-            yield from map(Sample, *by_joint, repeat(None) if mass is None else mass)
+        for W, tau, weight in self.blocks():
+            yield from map(Sample, W.reshape(-1, n, c), tau.reshape(-1, n), weight.reshape(-1, n))
 
     def select(self, columns: Array) -> "Problem":
         """Return the same rows with only the given columns: columns (b,)."""
@@ -95,17 +90,14 @@ class Problem:
             for W, tau, weight in self.blocks():
                 yield W[:, columns], tau, weight
 
-        masses = self.mass_stream
-
-        def mass_stream() -> Iterator[Array]:
-            for mass in masses() if masses is not None else ():
-                yield mass[..., columns]
-
+        names, sources = tuple(self.names[i] for i in columns), self.sources
         return replace(
-            self, stream=stream, names=tuple(self.names[i] for i in columns),
-            support=self.support[:, columns], mass_stream=None if masses is None else mass_stream,
-            sources=tuple(source.select(columns) for source in self.sources),
-        )  # fmt: skip
+            self,
+            stream=stream,
+            names=names,
+            support=self.support[:, columns],
+            sources=tuple(source.select(columns) for source in sources),
+        )
 
 
 def concatenate(problems: Sequence[Problem]) -> Problem:
@@ -119,13 +111,11 @@ def concatenate(problems: Sequence[Problem]) -> Problem:
                 f"problems differ in their columns: {len(first.names)} of {first.n_joints} "
                 f"joints and {len(other.names)} of {other.n_joints} joints"
             )
-    masses = [p.mass_stream for p in problems if p.mass_stream is not None]
-    has_mass, has_sources = len(masses) == len(problems), all(p.sources for p in problems)
+    has_sources = all(p.sources for p in problems)
     return replace(
         first,
         stream=lambda: chain.from_iterable(problem.blocks() for problem in problems),
         support=np.any([problem.support for problem in problems], axis=0),
-        mass_stream=(lambda: chain.from_iterable(m() for m in masses)) if has_mass else None,
         sources=tuple(source for p in problems for source in p.sources if has_sources),
     )
 

@@ -28,6 +28,7 @@ from robotid.robot.prior import prior_spread
 #: One instant of smooth motion: t [s], then q, v, a, tau, each of shape (n,).
 Instant = tuple[float, Array, Array, Array, Array]
 
+_ORDER = 4  # of the causal filter, even
 _SLOWEST = 1e-5  # smallest cut-off over the rate
 _GAP_CYCLES = 0.25  # longest pause without a gap [periods of the cut-off]
 _SETTLE = 4.0  # time after a start or a gap before the first instant [delays]
@@ -36,9 +37,7 @@ _SETTLE = 4.0  # time after a start or a gap before the first instant [delays]
 class LiveSignals:
     """Converts samples of q and tau online into instants of q, v, a, tau."""
 
-    def __init__(
-        self, n: int, rate: float, cutoff: float, order: int, is_continuous: Array
-    ) -> None:
+    def __init__(self, n: int, rate: float, cutoff: float, is_continuous: Array) -> None:
         if not 0 < cutoff < rate / 2:
             raise SettingsError(
                 f"cutoff {cutoff:g} Hz is not between 0 and half the rate {rate:g} Hz"
@@ -48,20 +47,18 @@ class LiveSignals:
                 f"cutoff {cutoff:g} Hz is less than {_SLOWEST:g} of the rate {rate:g} Hz, which is "
                 "too low for an exact filter. Set a larger cutoff, or correct the time stamps"
             )
-        if order < 2 or order % 2:
-            raise SettingsError(f"order is {order}, wanted an even number")
         self._step, self._n = 1.0 / rate, n
         self._is_continuous = np.asarray(is_continuous, dtype=bool)
         self._gap = max(_GAP_CYCLES / cutoff, 2.5 / rate)
-        self._M = _bessel(order, cutoff, rate)  # [x; y]_k+1 = M [x; u]_k
+        self._M = _bessel(_ORDER, cutoff, rate)  # [x; y]_k+1 = M [x; u]_k
         A, B, C = self._M[:-1, :-1], self._M[:-1, -1:], self._M[-1:, :-1]
-        inverse = np.linalg.inv(np.eye(order) - A)
+        inverse = np.linalg.inv(np.eye(_ORDER) - A)
         self._rest = (inverse @ B)[:, 0]  # state at a constant input of 1
         # of the instants after the samples [s]
         self.delay = (float((C @ inverse @ inverse @ B)[0, 0]) + 1.0) * self._step
         self._warm = int(np.ceil(_SETTLE * self.delay / self._step))
         self._last: tuple[float, Array] | None = None
-        self._x = np.zeros((order, 2 * n))
+        self._x = np.zeros((_ORDER, 2 * n))
         self._recent: list[Array] = []
         self._next, self._count = 0.0, 0
 
@@ -233,10 +230,7 @@ class Innovations:
 
 
 def payload_of(difference: Array, covariance: Array, columns: Array, spread: Array) -> Payload:
-    """Return the payload that explains a difference of the base parameters.
-
-    Minimises (d - K_L phi)^T C^-1 (d - K_L phi) + |phi / spread|^2.
-    """
+    """Return the payload with the least (d - K_L phi)^T C^-1 (d - K_L phi) + |phi / spread|^2."""
     # difference (b,), covariance (b, b), columns (b, 10), spread (10,)
     scale = np.sqrt(np.diag(covariance))
     L = scale[:, None] * np.linalg.cholesky(covariance / np.outer(scale, scale))
@@ -261,7 +255,6 @@ _ARRAYS = {1: ("q", "tau"), 3: ("q", "v", "a", "tau")}  # by the number of array
 _OVERSAMPLED = 12.0  # estimator updates per period of the cut-off
 _STORED_EVERY = 0.1  # time between stored states, for the reset after a change [s]
 _REOPENED = 0.1  # change of every parameter after a change, relative to its prior spread
-_ORDER = 4  # of the causal filter
 _ROWS = 20.0  # rate of the rows of the history [Hz]
 
 
@@ -353,7 +346,7 @@ class OnlineIdentifier:
         self.changes: tuple[Change, ...] = ()
         n = len(model.joints)
         is_continuous = np.array([joint.turns_freely for joint in model.limits])
-        self._signals = LiveSignals(n, s.rate, s.cutoff, _ORDER, is_continuous)
+        self._signals = LiveSignals(n, s.rate, s.cutoff, is_continuous)
         self.delay = self._signals.delay
         self._every = max(1, int(s.rate / (_OVERSAMPLED * s.cutoff)))
         self._pace()

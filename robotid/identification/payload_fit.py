@@ -15,14 +15,13 @@ from robotid.base.typing import Array
 from robotid.data.files.read import Readable
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.verdict.scale_check import PayloadCheck
-from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import join
 from robotid.estimation.estimators import Consistent, Constraints, Estimate
 from robotid.estimation.estimators.estimator import quantile
 from robotid.estimation.estimators.two_runs import Compared, TwoRuns, payload_runs
 from robotid.estimation.fitting.estimator_settings import ConsistentSettings
-from robotid.estimation.fitting.recorded import Recordings, hold_log
-from robotid.identification.pipeline import logs_of, robot_of, with_drives
+from robotid.estimation.fitting.recorded import Recordings
+from robotid.identification.pipeline import in_memory, logs_of, robot_of, with_drives
 from robotid.robot.bodies import link_transfer, usual_links
 from robotid.robot.closure import refuse_loops
 from robotid.robot.drive_term import DriveTerm
@@ -64,8 +63,7 @@ class Payload:
     def inertia_at_link(self) -> Array:
         """Inertia about the origin of the link's frame, shape (3, 3) [kg m^2]."""
         c = self.com
-        inertia: Array = self.inertia + self.mass * (c @ c * np.eye(3) - np.outer(c, c))
-        return inertia
+        return np.asarray(self.inertia + self.mass * (c @ c * np.eye(3) - np.outer(c, c)))
 
     @property
     def parameters(self) -> Array:
@@ -255,13 +253,10 @@ def identify_payload(
         require_each(value, str, name, wanted)
     require_kind(masses, (Mapping, type(None)), "masses", "a table of masses [kg] by link")
     model = robot_of(model, logs)
-    settings, mapping = signals or SignalSettings(), structural_mapping(model)
+    settings = signals or SignalSettings()
     wanted_families(friction, model.joints)
     read = [logs_of(model, given) for given in (logs, reference)]
-    loaded, without = (
-        Recordings(model, mapping, [hold_log(model, log, settings) for log in some])
-        for some in read
-    )
+    loaded, without = (in_memory(model, settings, some) for some in read)
     for what, runs in (("logs", loaded), ("reference", without)):
         if not runs.fitted:
             raise DataError(
@@ -271,8 +266,7 @@ def identify_payload(
 
     def rescaled(gains: Mapping[str, float]) -> Recordings:
         factor = np.array([gains.get(joint, 1.0) for joint in model.joints])
-        logs = [hold_log(model, replace(log, tau=factor * log.tau), settings) for log in read[1]]
-        return replace(without, fitted=logs)
+        return in_memory(model, settings, [replace(log, tau=factor * log.tau) for log in read[1]])
 
     return fit_with_friction(
         loaded, without, friction, rescaled, links=tuple(links) or usual_links(model),
@@ -290,10 +284,8 @@ def fit_with_friction(
     masses: Mapping[str, float],
     unknown_gains: Sequence[str] = (),
 ) -> PayloadFit:
-    """Identify payloads with the friction that the reference shows, and check known masses.
-
-    Friction is a torque, not a current: ``rescaled`` returns the reference with identified gains.
-    """
+    """Identify payloads with the friction that the reference shows, and check known masses."""
+    # friction is a torque, not a current: ``rescaled`` returns the reference with identified gains
     fitted = partial(fit_payloads, links=links, masses=masses, unknown_gains=unknown_gains)
     fit = fitted(loaded, reference)
     gains = {joint: gain.value for joint, gain in fit.gains.items()}

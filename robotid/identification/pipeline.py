@@ -1,4 +1,4 @@
-"""identify(): from a model and logs to parameters and a verdict on them."""
+"""From recordings to parameters and a verdict on them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
@@ -19,7 +19,6 @@ from robotid.data.files.columns import Needs
 from robotid.data.files.read import Readable, read_logs
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.diagnosis.residual.discrepancies import explain_residual
 from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.residual.misfit import settled
@@ -56,35 +55,12 @@ _ROBOTS = (".urdf", ".xml", ".xacro")  # suffixes of files that describe robots
 _MOST_SHAPES = 2  # fits for the refinement of shapes together with the terms of all joints
 
 
-def identify(
-    model: RobotModel | str | Path,
-    logs: Readable | Sequence[Readable],
-    *,
-    validation: Readable | Sequence[Readable] = (),
-    signals: SignalSettings | None = None,
-    estimator: EstimatorSettings | str = "consistent",
-    friction: str | Mapping[str, str] = AUTO,
-    doctor: bool = True,
-    ignore: Sequence[str] = (),
-    progress: ProgressCallback | None = None,
-) -> TorqueIdentification:
-    """Identify a robot's parameters from motion logs, as the command line does."""
-    choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
-    settings = signals or SignalSettings()
-    report_stage(progress, "reading logs")
-    model = robot_of(model, logs)
-    first, second = (logs_of(model, given) for given in (logs, validation))
-    if not first:
-        raise DataError("no log was given; at least one is needed to identify anything")
-    fitted, held_out = (
-        [hold_log(model, log, settings) for log in some] for some in (first, second)
-    )
-    report_stage(progress, "checking logs")
-    doctor_findings = diagnose(model, first, second, settings) if doctor else ()
-    recordings = Recordings(model, structural_mapping(model), fitted, held_out)
-    return conclude(
-        recordings, choice, doctor_findings, ignore, friction=friction, progress=progress
-    )
+def in_memory(
+    model: RobotModel, settings: SignalSettings, fitted: Sequence[Log], held_out: Sequence[Log] = ()
+) -> Recordings:
+    """Return the recordings of logs in memory."""
+    runs = [[hold_log(model, log, settings) for log in some] for some in (fitted, held_out)]
+    return Recordings(model, structural_mapping(model), *runs)
 
 
 def logs_of(

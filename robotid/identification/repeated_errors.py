@@ -51,11 +51,8 @@ _STEPS, _SETTLED = 20, 1e-3  # steps of noise level and s, relative change of s 
 
 
 def with_repeated_errors(recordings: Recordings) -> Recordings:
-    """Return recordings with the covariance of the score due to contacts, accelerometers, motion.
-
-    Surfaces have no errors of their points: their moments are measured, or unknown. The bias of
-    accelerometers is subtracted. Errors of the motion count without torques of joints.
-    """
+    """Return recordings with the score's covariance due to contacts, accelerometers, motion."""
+    # surfaces have no errors of their points: their moments are measured, or unknown
     model, mapping = recordings.model, recordings.mapping
     points = [k for k, x in enumerate(model.contacts) if x.kind == "point" and x.uncertainty != 0.0]
     bases = [log.head.base for log in recordings.fitted]
@@ -136,10 +133,7 @@ class EstimatedErrors:
 
 
 def _roots(fit: EstimatedErrors, sizes: Array, c: int) -> Array:
-    """Return a root of the covariance of all errors, (d, d).
-
-    Offsets of unknown size have the mean square along each axis of their links, pooled over points.
-    """
+    """Return a root of the covariance of all errors, (d, d); unknown offsets are alike by axis."""
     roots, is_open = np.diag(sizes), np.isnan(sizes)
     if is_open.any():
         squares = fit.squares.reshape(is_open.sum() // 3, 3, -1, 3)  # of each pair of points
@@ -245,10 +239,7 @@ def _shift(recordings: Recordings, theta: Array, step: int) -> Array:
 
 
 def _shift_of_motion(model: RobotModel, mapping: BaseMapping, rows: Rows, theta: Array) -> Array:
-    """Return E^T E theta, the mean of the score due to errors E of the regressor, shape (b,).
-
-    The errors of the acceleration of the base are those that cause the residual, sample by sample.
-    """
+    """Return E^T E theta, (b,): E, errors of the base's acceleration, causes the residual."""
     motion, shift = rows.trajectory, np.zeros(len(theta))
     pushed = [replace(motion, a=motion.a + np.eye(1, model.n_rows, k)) for k in range(6)]
     problems = [base_problem(model, mapping, x, rows.mask).blocks() for x in (motion, *pushed)]

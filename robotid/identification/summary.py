@@ -73,10 +73,7 @@ def left_out_lines(logs: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def variation_lines(variation: Mapping[str, Any] | None) -> list[str]:
-    """Return the spread of friction between logs, and what one more log would add, as text.
-
-    There is no line for fewer than three logs.
-    """
+    """Return the spread of friction between logs, and what one more log would add, as text."""
     if variation is None:
         return []
     shares: dict[str, list[float]] = {}
@@ -113,10 +110,7 @@ def one_more_gain(parameter: Mapping[str, Any]) -> tuple[float, float]:
 
 
 def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
-    """Return a verdict as lines of text: status, reasons, verdict on the other joints, and uses.
-
-    The order is that of the reasons. A reason of a joint is the line of that joint.
-    """
+    """Return a verdict as text: status, reasons (a joint's as its line), other joints, uses."""
     by_cell: dict[str, list[str]] = {}
     for name, joint in verdict["per_joint"].items():
         by_cell.setdefault(verdict_cell(name, joint), []).append(name)

@@ -87,10 +87,7 @@ def _transfers(frames: Sequence[pin.Frame]) -> Array:
 
 
 def held_parameters(model: RobotModel) -> Array:
-    """Return the share of each body of links behind locked joints, (10 bodies,).
-
-    They keep the URDF's inertials, so the rest of the body must be physically consistent by itself.
-    """
+    """Return the share of links behind locked joints, which keep the URDF's, (10 bodies,)."""
     held = np.zeros((len(model.layout.bodies), 10))
     for place in link_places(model):
         if place.body >= 0 and place.role == "held":
@@ -128,10 +125,7 @@ def central_inertial(parameters: Array) -> Inertial:
 
 
 def principal_moments(parameters: Array) -> tuple[Array, Array]:
-    """Return the second moments of mass (3,) about the centre along the principal axes, and these.
-
-    A body is physically consistent if none is negative; moments of inertia are sums of two.
-    """
+    """Return the second moments (3,) about the centre along the principal axes, and these."""
     H = np.column_stack([np.eye(3), -parameters[1:4] / parameters[0]])  # to the centre
     moments, axes = np.linalg.eigh(H @ pseudo_inertia(parameters)[0] @ H.T)
     axes[:, 0] *= np.sign(np.linalg.det(axes))
@@ -139,14 +133,11 @@ def principal_moments(parameters: Array) -> tuple[Array, Array]:
 
 
 def least_density(parameters: Array) -> float:
-    """Return the smallest density that a body's mass and second moments of mass allow [kg/m^3].
-
-    Of all bodies with the same mass and the same largest density, a homogeneous ellipsoid has the
-    smallest determinant of second moments; with semi-axes a these are m a^2 / 5.
-    """
+    """Return the smallest density that mass and second moments allow, an ellipsoid's [kg/m^3]."""
     mass = float(parameters[0])
     if mass <= 0:
         return 0.0
+    # the moments of a homogeneous ellipsoid with semi-axes a are m a^2 / 5
     axes = np.sqrt(5.0 * np.maximum(principal_moments(parameters)[0], 0.0) / mass)  # (3,) [m]
     volume = 4.0 / 3.0 * np.pi * float(np.prod(axes))
     return mass / volume if volume > 0 else float("inf")
@@ -155,11 +146,9 @@ def least_density(parameters: Array) -> float:
 def density_share(
     parameters: Array, covariance: Array, density: float, rng: np.random.Generator
 ) -> float:
-    """Return the share of the bodies that the errors allow that need at most a density [-].
+    """Return the share of the consistent bodies that the errors allow that need at most a density.
 
-    Bodies are drawn from the normal distribution of the estimate; draws that no mass distribution
-    has, with a pseudo-inertia that is not positive definite, are left out. With J the
-    pseudo-inertia, ``least_density`` is m^3 / (4/3 pi 5^1.5 sqrt(det J)).
+    With J the pseudo-inertia, ``least_density`` is m^3 / (4/3 pi 5^1.5 sqrt(det J)).
     """
     values, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.maximum(values, 0.0))

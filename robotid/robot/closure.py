@@ -53,11 +53,9 @@ class Chains:
     def closed(self, q: Array, unknown: Array) -> Array:
         """Return positions q (N, n) with the unknown ones, (n,) bool, such that the loops close.
 
-        The first ones are found on a path from the closed position nearest to 0, which states how
-        the chains are assembled; each of the others from the one before it. From the first sample
-        at which the loops do not close, the coordinates are constant; see ``gaps``.
+        The coordinates are constant from the first sample at which they do not; see ``gaps``.
         """
-        x, closed = self._assembled(), q.copy()
+        x, closed = self._assembled(), q.copy()  # how the chains are assembled
         singular = np.linalg.svd(self._equations(x)[1][:, unknown], compute_uv=False)
         if np.sum(singular > _DEAD * self._model.length) < unknown.sum():
             names = listed([self._model.joints[j] for j in np.flatnonzero(unknown)])
@@ -81,10 +79,9 @@ class Chains:
         return bool(self.gaps(x[None]).max() <= _CLOSED * self._model.length)
 
     def random_states(self, samples: int, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Return random states: coordinates (N, n) at which the loops close, and Z (N, n, n).
+        """Return closed coordinates (N, n) and orthogonal projectors Z (N, n, n): speeds Z v.
 
-        A random walk keeps the chains assembled as in the zero position: it does not cross dead
-        centres. Z v are speeds that the loops permit, Z is an orthogonal projector.
+        The random walk does not cross dead centres: chains stay assembled as in the zero position.
         """
         n = len(self._model.joints)
         every, size = np.ones(n, dtype=bool), np.where(self._is_long, self._model.length, 1.0)

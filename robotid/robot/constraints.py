@@ -3,7 +3,7 @@
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass
-from functools import cache
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -168,10 +168,7 @@ class Loop(Settings):
         return np.vstack([relative[:3], self._across(placement.rotation) @ relative[3:]])
 
     def error(self, placements: Sequence[pin.SE3]) -> Array:
-        """Return the displacement that the loop prevents, shape (m,) [m, rad]; 0 if it is closed.
-
-        Its rate is the prevented velocity, if it is small.
-        """
+        """Return the displacement that the loop prevents, (m,) [m, rad]; 0 if it is closed."""
         first, second = placements
         displacement = np.zeros(self.sizes[self.kind])
         displacement[:3] = first.translation - second.translation
@@ -184,10 +181,7 @@ class Loop(Settings):
         return displacement
 
     def drift(self, accelerations: Sequence[Array], speeds: Sequence[Array], R: Array) -> Array:
-        """Return the prevented acceleration dJ/dt v without accelerations of joints, shape (m,).
-
-        R are the axes of the first frame; speeds, of both frames, are angular velocities (3,).
-        """
+        """Return dJ/dt v, (m,): R are the first frame's axes, speeds angular velocities (3,)."""
         relative = accelerations[0] - accelerations[1]  # axes of the world, (6,)
         if self.kind != "hinge":
             return relative[: self.sizes[self.kind]]
@@ -197,13 +191,12 @@ class Loop(Settings):
 
     def _across(self, rotation: Array) -> Array:
         """Return two directions perpendicular to the axis, fixed in the first link, (2, 3)."""
-        return np.asarray(_perpendicular(tuple(self.axis)) @ rotation.T)
+        return np.asarray(self._perpendicular @ rotation.T)
 
-
-@cache
-def _perpendicular(axis: tuple[float, ...]) -> Array:
-    """Return two directions perpendicular to an axis, shape (2, 3)."""
-    return np.asarray(np.linalg.svd(np.array(axis, dtype=float)[None])[2][1:])
+    @cached_property
+    def _perpendicular(self) -> Array:
+        """Two directions perpendicular to the axis, shape (2, 3)."""
+        return np.asarray(np.linalg.svd(np.array(self.axis, dtype=float)[None])[2][1:])
 
 
 Constraint = Contact | Loop

@@ -1,7 +1,4 @@
-"""Base classes of the terms of a drive's torque, and families of terms.
-
-``drives`` has the terms and the families.
-"""
+"""Base classes of the terms and families of terms of a drive's torque that ``drives`` has."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -16,7 +13,7 @@ import numpy as np
 from robotid.base.exceptions import SettingsError
 from robotid.base.settings import is_number
 from robotid.base.typing import Array
-from robotid.robot.urdf_text import LARGEST
+from robotid.robot.tree import LARGEST
 
 #: A law's value and its derivative.
 Slope: TypeAlias = tuple[Array | float, Array | float]
@@ -122,13 +119,10 @@ def _is_range(value: Any) -> bool:  # noqa: ANN401
 
 @dataclass(frozen=True)
 class MemorylessTerm(DriveTerm):
-    """A term without internal state: a(v) b(q), times direction and load.
+    """A term without internal state: a(v) b(q), times direction and load."""
 
-    A law returns a(v) with da/dv, or b(q) with db/dq. Its arguments are the speed or position, and
-    up to four shape parameters of the term by their names. It is evaluated on NumPy's arrays and,
-    compiled by Numba, on scalars. Regressor, plant and simulations use it.
-    """
-
+    # A law returns a(v) with da/dv, or b(q) with db/dq, from the speed or position and up to four
+    # shape parameters of the term by their names: of NumPy's arrays and, by Numba, of scalars.
     speed_law: ClassVar[Law | None] = None  # the law a of the speed, a static method; None: 1
     position_law: ClassVar[Law | None] = None  # the law b of the position, likewise
     is_loaded: ClassVar[bool] = False  # whether the absolute joint load torque multiplies it

@@ -1,16 +1,11 @@
-"""The terms of a drive's torque, one class each.
+"""The terms of a drive's torque: a term adds ``parameter * column``.
 
-A term adds ``parameter * column`` to the torque of a drive. To add one, write its class with its
-laws, and enter it in ``TERMS`` if it has no shape parameters, else in ``TERM_CLASSES`` and
-``FAMILIES``. Regressor, prior spread, plant, simulations with their sensitivities, choice, sidecar,
-tables, curves, exports and job key need no further code.
-
-The columns of many terms are guarded: outside the speeds or positions of the data they are constant
-at the value of the end of that range, since no data determine them there.
+To add one, write its class with its laws, and enter it in ``TERMS`` if it has no shape parameters,
+else in ``TERM_CLASSES`` and ``FAMILIES``. Guarded columns are constant outside the data's range.
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Any, ClassVar
@@ -31,7 +26,7 @@ from robotid.robot.drive_term import (
     Slope,
     linear,
 )
-from robotid.robot.urdf_text import LARGEST
+from robotid.robot.tree import LARGEST
 
 _LEAST = 1e-12  # [rad/s or m/s] speed below which the slope of a power is constant
 _POSITIVE = (1.0 / LARGEST, LARGEST)  # bounds of shape parameters that are divisors
@@ -101,12 +96,7 @@ class Asymmetric(MemorylessTerm):
 
 
 class LoadFriction(MemorylessTerm):
-    """Coulomb friction proportional to the joint load torque, tau = mu sign(w) |tau_rigid|.
-
-    References:
-        Hamon, Gautier, Garrec (2010), Dynamic identification of robots with a dry friction model
-        depending on load and velocity.
-    """
+    """Friction of the joint load torque, tau = mu sign(w) |tau_rigid| (Hamon, Gautier 2010)."""
 
     label = "load"
     units = ("N m per N m", "N per N")
@@ -133,15 +123,7 @@ class Cubic(MemorylessTerm):
 
 @dataclass(frozen=True)
 class Stribeck(MemorylessTerm):
-    """Friction in addition to Coulomb's that decays with speed, tau = x sign(w) exp(-|w| / w_s).
-
-    A positive x is the Stribeck effect at low speed; with a negative x friction rises with speed
-    and saturates.
-
-    References:
-        Tustin (1947), The effects of backlash and of speed-dependent friction on the stability of
-        closed-cycle control systems.
-    """
+    """Friction that decays with speed (Tustin 1947), or rises: tau = x sign(w) exp(-|w| / w_s)."""
 
     speed: float = 0.1
 
@@ -221,10 +203,7 @@ class Ramp(MemorylessTerm):
 
 @dataclass(frozen=True)
 class Harmonic(MemorylessTerm):
-    """A torque that is periodic in the angle of joint or motor: cos or sin of ``order`` times q.
-
-    With ``order`` equal to the gear ratio, or a multiple of it, it is periodic in the motor angle.
-    """
+    """A periodic torque: cos or sin of ``order`` times q; of the motor, multiples of its ratio."""
 
     order: float = 1.0
     is_sine: bool = False
@@ -286,11 +265,7 @@ class Bristles(DriveTerm):
 
     @staticmethod
     def law(x: Sequence[float], way: Array, v: Array) -> tuple[Array, Array, Array]:
-        """Return the coefficients with which a displacement changes the deflection z.
-
-        After a displacement in one direction, at one speed, z is sign(v) g + (z - sign(v) g) decay;
-        its steady value is g(v) = 1 + c exp(-(v / w)^2).
-        """
+        """Return g(v) = 1 + c exp(-(v / w)^2), dg/dv, decay: z = s g + (z_0 - s g) decay."""
         extra = x[2] * np.exp(-((v / x[1]) ** 2))
         g = 1.0 + extra
         return g, -2.0 * v / (x[1] * x[1]) * extra, np.exp(-np.abs(way) / (x[0] * g))
@@ -305,10 +280,7 @@ class Bristles(DriveTerm):
         return self.law(self.numbers, np.zeros_like(v), v)[0]
 
     def column(self, motion: DriveMotion) -> Array:
-        """Return z along segments, initialised with its steady value.
-
-        It is exact between two samples if the sign of v and g are constant there.
-        """
+        """Return z along segments from its steady value; exact for constant sign of v and g."""
         if motion.begins is None:
             return motion.direction * self.level(motion.v)
         from scipy.linalg.lapack import dtbtrs
@@ -324,25 +296,14 @@ class Bristles(DriveTerm):
 
 
 class Presliding(Bristles):
-    """Friction x z that builds up over a displacement after each reversal.
-
-    dz/ds = 1 - z sign(v) with the displacement s = q / s_0: z goes from -1 to 1 after a reversal.
-
-    References:
-        Dahl (1968), A solid friction model.
-    """
+    """Friction x z (Dahl 1968): dz/ds = 1 - z sign(v), s = q / s_0: -1 to 1 after a reversal."""
 
     label = "presliding"
 
 
 @dataclass(frozen=True)
 class LuGre(Bristles):
-    """Presliding with Stribeck effect: dz/ds = 1 - z sign(v) / g(v), g = 1 + c exp(-(w/w_s)^2).
-
-    References:
-        Canudas de Wit, Olsson, Astrom, Lischinsky (1995), A new model for control of systems with
-        friction; without its micro-damping.
-    """
+    """LuGre friction (Canudas de Wit 1995), no micro-damping: g = 1 + c exp(-(w/w_s)^2)."""
 
     speed: float = 0.1
     excess: float = 0.5
@@ -397,16 +358,12 @@ class Hat(MemorylessTerm):
 
 @dataclass(frozen=True)
 class Counterbalance(MemorylessTerm):
-    """A spring between two known points, tau = k (L - L_0) dL/dq.
+    """A spring of length L, tau = k (L - L_0) dL/dq, L^2 = a^2 + b^2 - 2 a b cos(q - q_0)."""
 
-    One point moves with the joint at a distance a from its axis, the other is fixed at a distance
-    b. The length of the spring is L with L^2 = a^2 + b^2 - 2 a b cos(q - q_0), smallest at q_0.
-    """
-
-    arm: float = 0.1
-    base: float = 0.5
-    angle: float = 0.0
-    rest: float = 0.0
+    arm: float = 0.1  # a: from the axis to the point that moves with the joint
+    base: float = 0.5  # b: from the axis to the fixed point
+    angle: float = 0.0  # q_0, at which it is shortest
+    rest: float = 0.0  # L_0
 
     label = "counterbalance"
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {"arm": _POSITIVE, "base": _POSITIVE}
@@ -484,15 +441,10 @@ def _table(data_range: DataRange) -> tuple[DriveTerm, ...]:
     )
 
 
-def _harmonics(highest: int) -> Callable[[DataRange], tuple[DriveTerm, ...]]:
-    def make(data_range: DataRange) -> tuple[DriveTerm, ...]:
-        return tuple(
-            Harmonic(data_range=data_range["q"], order=float(k), is_sine=is_sine)
-            for k in range(1, highest + 1)
-            for is_sine in (False, True)
-        )
-
-    return make
+def _harmonics(data_range: DataRange, highest: int) -> tuple[DriveTerm, ...]:
+    orders = [float(k) for k in range(1, highest + 1) for _ in range(2)]
+    sines = (False, True) * highest
+    return tuple(Harmonic(data_range["q"], *both) for both in zip(orders, sines, strict=True))
 
 
 def _by_position(data_range: DataRange) -> tuple[DriveTerm, ...]:
@@ -526,11 +478,12 @@ FAMILIES: dict[str, Family] = {
                # unguarded, since gravity contains them too
                lambda data_range: (Harmonic(), Harmonic(is_sine=True)), needs=0.1),
         Family("harmonics2", "a spring or counterbalance torque that depends on the position",
-               _harmonics(2), needs=0.5, is_automatic=True, code="spring",
+               lambda own: _harmonics(own, 2), needs=0.5, is_automatic=True, code="spring",
                instead=("harmonics1", "spring")),
         Family("harmonics4",
                "a torque that is periodic in the joint's position (cogging, an eccentric gear)",
-               _harmonics(4), needs=0.5, is_automatic=True, code="position_periodic"),
+               lambda own: _harmonics(own, 4), needs=0.5, is_automatic=True,
+               code="position_periodic"),
         Family("asymmetric", "viscous friction that differs by direction",
                lambda data_range: (Asymmetric(),), is_automatic=True, code="friction_shape",
                has_size=True),

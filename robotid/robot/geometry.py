@@ -14,19 +14,18 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from robotid.base.exceptions import MissingDependencyError, SettingsError
+from robotid.base.exceptions import MissingDependencyError
 from robotid.base.typing import Array
 from robotid.robot.bodies import link_places
 from robotid.robot.examples import example_urdfs
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
-from robotid.robot.urdf_text import LARGEST, numbers
+from robotid.robot.tree import LARGEST, numbers
 
 _FORMATS = (".stl", ".dae", ".obj", ".ply", ".off", ".glb", ".gltf")
 _MOST_BYTES = 2**28  # of a mesh; that of a link has about 2**20
 
 _SIDES = 16  # of the prism around a cylinder
-_MOST_FACES = 100  # a hull with more is replaced by an outer polytope with this many faces
 _GROWN = 0.05  # enlargement on each side of the box of a body's geometry, over its diagonal
 _GROWN_BLIND = 0.35  # the same of the box of its frames only, which have no width
 #: Share of the robot's length that a body extends at least beyond its frames, on each side.
@@ -74,12 +73,7 @@ def read_shapes(robot: ET.Element, tag: str = "visual") -> tuple[Shape, ...]:
 
 
 def find_mesh(name: str, urdf: str | Path) -> Path | None:
-    """Return the file of a mesh, None if there is none.
-
-    A relative path, or one with ``package://``, is searched in ROS_PACKAGE_PATH, in the URDF's
-    folder and its parents, and in example-robot-data, with the name of its package and without it.
-    A path in a package with ".." is not accepted. Folders, pipes and devices are not meshes.
-    """
+    """Return the file of a mesh, None if there is none; not folders, pipes and devices."""
     if name.startswith("file://"):
         path = Path(name.removeprefix("file://"))
         return path if os.path.isfile(path) else None
@@ -101,31 +95,27 @@ def find_mesh(name: str, urdf: str | Path) -> Path | None:
 
 def read_surfaces(path: Path) -> tuple[Surface, ...]:
     """Read a mesh: STL, DAE, OBJ, PLY, OFF or glTF."""
-    if path.suffix.lower() not in _FORMATS:
-        raise ValueError(f"{path.name} is not a mesh, wanted {', '.join(_FORMATS)}")
-    try:
-        return _read_surfaces(path)
-    except Exception as error:  # the readers of the formats raise errors of every kind
-        raise ValueError(f"{path.name} cannot be read: {error}") from error
-
-
-def _read_surfaces(path: Path) -> tuple[Surface, ...]:
     import trimesh
 
-    if path.stat().st_size > _MOST_BYTES:
-        raise ValueError(f"the file has more than {_MOST_BYTES // 2**20} MiB")
-    scene = trimesh.load_scene(path)
-    metres = 1.0
-    if path.suffix.lower() == ".dae":  # the one format that states its unit
-        metres = float(trimesh.units.unit_conversion(scene.units or "meters", "meters"))
+    if path.suffix.lower() not in _FORMATS:
+        raise ValueError(f"{path.name} is not a mesh, wanted {', '.join(_FORMATS)}")
     by_colour: dict[tuple[float, ...] | None, list[Surface]] = {}
-    for mesh in scene.dump():
-        if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
-            rgba = _mesh_colour(mesh.visual)
-            surface = Surface(metres * np.asarray(mesh.vertices), np.asarray(mesh.faces), rgba)
-            if not np.abs(surface.vertices).max(initial=0.0) <= LARGEST:
-                raise ValueError(f"a corner is not finite, or beyond {LARGEST:g} m")
-            by_colour.setdefault(rgba, []).append(surface)
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise ValueError(f"the file has more than {_MOST_BYTES // 2**20} MiB")
+        scene = trimesh.load_scene(path)
+        metres = 1.0
+        if path.suffix.lower() == ".dae":  # the one format that states its unit
+            metres = float(trimesh.units.unit_conversion(scene.units or "meters", "meters"))
+        for mesh in scene.dump():
+            if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
+                rgba = _mesh_colour(mesh.visual)
+                surface = Surface(metres * np.asarray(mesh.vertices), np.asarray(mesh.faces), rgba)
+                if not np.abs(surface.vertices).max(initial=0.0) <= LARGEST:
+                    raise ValueError(f"a corner is not finite, or beyond {LARGEST:g} m")
+                by_colour.setdefault(rgba, []).append(surface)
+    except Exception as error:  # the readers of the formats raise errors of every kind
+        raise ValueError(f"{path.name} cannot be read: {error}") from error
     return tuple(joined(surfaces) for surfaces in by_colour.values())
 
 
@@ -192,31 +182,16 @@ def _mesh_colour(visual: Any) -> tuple[float, ...] | None:  # noqa: ANN401
 
 def joined(surfaces: Sequence[Surface]) -> Surface:
     """Return surfaces as one, of the first one's colour."""
-    starts = np.cumsum([0, *(len(s.vertices) for s in surfaces[:-1])])
-    faces = [s.faces + start for s, start in zip(surfaces, starts, strict=True)]
-    vertices = np.vstack([s.vertices for s in surfaces])
-    return Surface(vertices, np.vstack(faces), surfaces[0].rgba)
+    from trimesh.util import append_faces
 
-
-def geometry_half_spaces(model: RobotModel, shape: str) -> dict[str, tuple[Array, Array]]:
-    """Return bounds on the centres of mass from the URDF's geometry."""
-    if shape == "none":
-        return {}
-    points = body_points(model)
-    if not points:
-        raise SettingsError(
-            f"com_within is {shape!r}, but no link has readable geometry in "
-            f"{Path(model.tree.path).name}; state boxes with 'com', or omit com_within"
-        )
-    around = box_half_spaces if shape == "box" else hull_half_spaces
-    return {body: around(cloud) for body, cloud in points.items()}
+    vertices, faces = append_faces([s.vertices for s in surfaces], [s.faces for s in surfaces])
+    return Surface(vertices, faces, surfaces[0].rgba)
 
 
 def body_points(model: RobotModel, *, with_visual: bool = False) -> dict[str, Array]:
-    """Return points whose convex hull contains each body, (k, 3) [m], in its moved link's frame.
+    """Return points whose hull contains each body, (k, 3) [m], in its moved link's frame.
 
-    A body is omitted if one of its links with mass has no geometry, or a mesh that is not found:
-    its mass has no bounds. The visual geometry is added to the other on demand.
+    A body is omitted if a link with mass has no geometry, or a mesh that is not found.
     """
     clouds, unread = link_clouds(model)
     seen = {link for link, *_ in clouds}
@@ -233,12 +208,7 @@ def body_points(model: RobotModel, *, with_visual: bool = False) -> dict[str, Ar
 def link_clouds(
     model: RobotModel, tags: tuple[str, ...] = ("visual", "collision")
 ) -> tuple[list[tuple[str, int, Array]], list[str]]:
-    """Return points (k, 3) [m] whose hulls contain the shapes of links, in the body's frame.
-
-    They are those of a link's collision geometry, or of its visual one if it has none; curved
-    shapes are replaced by polyhedra around them. Each has its link and its body. Links of which a
-    shape cannot be read are listed beside them.
-    """
+    """Return link, body and points (k, 3) [m] whose hull contains a shape, and unreadable links."""
     shapes = _clouds(model.tree.robot, model.tree.path, tags)
     clouds, unread = [], []
     for link in model.tree.links:
@@ -255,10 +225,7 @@ def link_clouds(
 def body_boxes(model: RobotModel) -> dict[str, Array]:
     """Return a box (2, 3) [m] that contains all mass of each body, in its moved link's frame.
 
-    It contains the body's geometry, enlarged by 5 % of its diagonal on each side. For a body
-    without geometry it contains its frames (of its joints, links and tools), enlarged by 35 % and
-    at least 10 % of the robot's longest link. It also contains the URDF's body: the uniform box of
-    equal mass, centre and second moments.
+    It contains the enlarged geometry or frames, and the uniform box with the URDF's moments.
     """
     bodies, frames = model.layout.bodies, body_frames(model)
     shapes, boxes = body_points(model), {}
@@ -279,12 +246,10 @@ def body_boxes(model: RobotModel) -> dict[str, Array]:
 
 
 def kinematic_lengths(model: RobotModel) -> dict[str, float]:
-    """Return the length that the kinematics give each body, whether or not it has geometry.
+    """Return the length that the kinematics give each body, if finite and not 0 [m].
 
-    It is the largest distance between the body's frames (of its joints, links and tools) or from
-    its joint to the one before it, and 10 % of the robot's length for housings beyond the joints.
-    The travel of prismatic joints at the body is added; next to one without limits a body has no
-    length here, and neither has a robot whose joints all coincide.
+    It is the largest distance between its frames, or to the joint before it, plus the travel of
+    prismatic joints at the body, and 10 % of the robot's length for housings beyond the joints.
     """
     pins, bodies, frames = model.pin_model, model.layout.bodies, body_frames(model)
     steps = [float(np.linalg.norm(place.translation)) for place in pins.jointPlacements]
@@ -305,30 +270,6 @@ def kinematic_lengths(model: RobotModel) -> dict[str, float]:
         if 0 < length < np.inf:
             lengths[body] = length
     return lengths
-
-
-def box_half_spaces(points: Array) -> tuple[Array, Array]:
-    """Return the axis-parallel box around points: A c <= b, A of shape (6, 3), b of (6,) [m]."""
-    A = np.vstack([np.eye(3), -np.eye(3)])
-    return A, (A @ points.T).max(axis=1)
-
-
-def hull_half_spaces(points: Array) -> tuple[Array, Array]:
-    """Return the convex hull of points as half-spaces A c <= b: -> (f, 3), (f,) [m]."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    try:
-        planes = ConvexHull(points).equations  # n^T x + o <= 0
-    except QhullError:  # all points in one plane
-        return box_half_spaces(points)
-    planes = planes[np.unique(np.round(planes, 9), axis=0, return_index=True)[1]]
-    if len(planes) <= _MOST_FACES:
-        return planes[:, :3], -planes[:, 3]
-    k = np.arange(_MOST_FACES) + 0.5
-    polar, angle = np.arccos(1 - 2 * k / _MOST_FACES), np.pi * (1 + 5**0.5) * k
-    x, y = np.cos(angle) * np.sin(polar), np.sin(angle) * np.sin(polar)
-    A = np.column_stack([x, y, np.cos(polar)])
-    return A, (A @ points.T).max(axis=1)
 
 
 def body_frames(model: RobotModel) -> dict[str, list[Array]]:

@@ -46,9 +46,9 @@ def check_mass_matrix(
     q = rng.uniform(lower, upper, (poses, len(free)))
     if model.free_flyer:  # the pose of the base has no effect
         q = np.hstack([np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (poses, 1)), q])
-    bodies, smallest, positive = model.with_parameters(pi), np.inf, 0
+    smallest, positive = np.inf, 0
     for first in range(0, poses, _BLOCK):
-        M = _mass_matrices(bodies, pi, q[first : first + _BLOCK])
+        M = joint_mass_matrices(model, pi, q[first : first + _BLOCK])
         if first and _are_above(M, max(smallest, 0.0)):
             positive += len(M)
             continue
@@ -68,14 +68,9 @@ def _are_above(M: Array, least: float) -> bool:
 
 def joint_mass_matrices(model: RobotModel, pi: Array, q: Array) -> Array:
     """Return the mass matrices at q (N, n), armatures included, shape (N, n_rows, n_rows)."""
-    return _mass_matrices(model.with_parameters(pi), pi, q)
-
-
-def _mass_matrices(bodies: RobotModel, pi: Array, q: Array) -> Array:
-    """Return ``joint_mass_matrices`` of a robot that already has the parameters."""
-    M = rigid_mass_matrices(bodies, bodies.configurations(q))
-    first = bodies.n_rows - len(bodies.joints)
-    M[:, first:, first:] += drive_inertia(bodies.layout, pi)
+    M = rigid_mass_matrices(model.with_parameters(pi), model.configurations(q))
+    first = model.n_rows - len(model.joints)
+    M[:, first:, first:] += drive_inertia(model.layout, pi)
     return M
 
 

@@ -20,6 +20,7 @@ from robotid.robot.drive_term import DriveMotion, DriveTerm
 from robotid.robot.drives import DRIVE_TERMS, TERMS
 from robotid.robot.parameters import DYNAMICS, Coupling, ParameterLayout
 from robotid.robot.tree import (
+    LARGEST,
     SMALLEST_LENGTH,
     Joint,
     Tree,
@@ -27,7 +28,6 @@ from robotid.robot.tree import (
     mimic_followers,
     read_tree,
 )
-from robotid.robot.urdf_text import LARGEST
 
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
 _STRONGEST = 100.0  # [m/s^2] with more, accelerations are negligible beside gravity
@@ -256,10 +256,7 @@ class RobotModel:
 
     @property
     def length(self) -> float:
-        """The longest distance between neighbouring joints [m], a scale of the robot.
-
-        1 if all axes are within 1 cm, as that of a pendulum: its links are longer than this.
-        """
+        """The longest distance between neighbouring joints [m]; 1 if all axes are within 1 cm."""
         placements = self.pin_model.jointPlacements[1:]
         longest = max(float(np.linalg.norm(placement.translation)) for placement in placements)
         return longest if longest > SMALLEST_LENGTH else 1.0
@@ -397,23 +394,12 @@ class RobotModel:
 
 
 def pinocchio_model(model: RobotModel, pi: Array) -> pin.Model:
-    """Return Pinocchio's model with inertias, armature, damping and dry friction of parameters.
-
-    Bodies behind locked joints are part of the links before them. With q, v and a of the model,
+    """Return Pinocchio's model with inertias, armature, damping and dry friction of pi (p,).
 
     ``tau = rnea(q, v, a) + damping v - where(v > 0, lowerDryFrictionLimit, upperDryFrictionLimit)``
-
-    is the predicted torque of moving joints: ``rnea`` includes the armature, and the dry friction
-    of a joint that moves forwards is at its lower limit. Coulomb friction Fc and offset give the
-    limits -Fc - offset and Fc - offset; at rest, dry friction is anywhere between them. With mimic
-    joints or another order of joints, ``RobotModel.configurations`` and ``velocity_map`` convert
-    the identified joints to Pinocchio's, and torques back.
-
-    Terms without such a field are omitted, and a warning names them: friction and inertia of
-    couplings, and friction that depends on load, position or an internal state or, other than
-    linearly, on speed.
-
-    pi (p,).
+    is the predicted torque of moving joints, with the limits -Fc - offset and Fc - offset;
+    ``RobotModel.configurations`` and ``velocity_map`` convert the identified joints to Pinocchio's.
+    A warning names terms without such a field, which are omitted.
     """
     layout, made = model.layout, pin.Model(model.with_parameters(pi).pin_model)
     fields = {term: np.zeros(made.nv) for term in ("armature", "viscous", "coulomb", "offset")}

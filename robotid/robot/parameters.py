@@ -20,7 +20,7 @@ from robotid.base.settings import (
 from robotid.base.typing import Array, frozen
 from robotid.robot.drive_term import DriveTerm
 from robotid.robot.drives import DRIVE_TERMS, TERMS
-from robotid.robot.urdf_text import LARGEST
+from robotid.robot.tree import LARGEST
 
 #: The identified dynamics: all, or those of poses at rest and slow motion.
 DYNAMICS = ("full", "static")
@@ -32,11 +32,7 @@ PAPER_TERMS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mcx", "mcy", "mcz", "m
 
 @dataclass(frozen=True)
 class Coupling(Settings):
-    """A drive that moves with several joints, at the speed w = sum_j ratio_j v_j.
-
-    Its drive terms load each of these joints:
-    ``tau_j += ratio_j (Ia dw/dt + Fv w + Fc sign w)``.
-    """
+    """A drive with w = sum_j ratio_j v_j: ``tau_j += ratio_j (Ia dw/dt + Fv w + Fc sign w)``."""
 
     name: str = setting(MISSING, "name of the drive, used in parameter names")
     ratios: tuple[tuple[str, float], ...] = setting(
@@ -65,11 +61,7 @@ class Coupling(Settings):
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """The standard parameters of a model and their order.
-
-    Ten inertial parameters per body, then the drive terms joint by joint, then those of each
-    coupling (without an offset, unless it replaces the drive of a joint).
-    """
+    """The standard parameters: ten inertial ones per body, drive terms by joint, by coupling."""
 
     bodies: tuple[str, ...]  # one per movable joint, and one for a floating base
     joints: tuple[str, ...]  # those that move
@@ -138,10 +130,7 @@ class ParameterLayout:
 
     @cached_property
     def drives(self) -> tuple[Coupling, ...]:
-        """The drives: one per joint, which moves this joint only, then the couplings.
-
-        A coupling that replaces the drive of a joint has its index.
-        """
+        """The drives: one per joint (or the coupling that replaces it), then other couplings."""
         instead = {c.name: c for c in self.couplings if c.replaces}
         own = [instead.get(joint, Coupling(joint, ((joint, 1.0),))) for joint in self.joints]
         return (*own, *(coupling for coupling in self.couplings if not coupling.replaces))
@@ -159,9 +148,8 @@ class ParameterLayout:
     def drive_speeds(self) -> Array:
         """Speed of each of the d drives that is equivalent to 1 rad/s, (d,) [rad/s or m/s].
 
-        At this speed a prismatic joint crosses its stroke (1 m if the URDF states none) in the time
-        of one revolution at 1 rad/s. A coupling has the mean of its joints, weighted by their
-        ratios.
+        A prismatic joint crosses its stroke (or 1 m) in the time of a revolution; a coupling has
+        the mean of its joints, weighted by their ratios.
         """
         joints = [
             self.strokes.get(joint, 1.0) / (2 * np.pi) if joint in self.prismatic else 1.0
@@ -236,11 +224,8 @@ class ParameterLayout:
         return np.append(inertial, np.where(rotary, length**2, 1.0))
 
     def preference(self) -> Array:
-        """Return the preference of each parameter as the name of a base parameter, shape (p,).
-
-        Inertias have a larger one than first moments, and these than masses. The groups are short
-        then: on a UR they have 59 further coefficients, with plain pivoting 142.
-        """
+        """Return the preference of each parameter as the name of a base parameter, shape (p,)."""
+        # groups are short then: on a UR they have 59 further coefficients, else 142
         inertial = [0.1, *[0.3] * 3, *[1.0] * 6] * len(self.bodies)
         return np.array(inertial + [term.preference for _, term in self.drive_parameters])
 
@@ -254,21 +239,14 @@ class ParameterLayout:
 
 
 def to_paper_order(pi: Array) -> Array:
-    """Return inertial parameters (10 n,) in the order of the paper's vector (9), (10).
-
-    References:
-        Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (9)-(10).
-    """
+    """Return inertial parameters (10 n,) in the order of the paper's vector (9), (10)."""
     order = [INERTIAL_TERMS.index(term) for term in PAPER_TERMS]
     return _by_body(pi)[:, order].reshape(-1)
 
 
 @cache
 def pseudo_inertia_basis() -> Array:
-    """Return the ten symmetric matrices B_k with J(pi) = sum_k pi_k B_k, shape (10, 4, 4).
-
-    The parameters are in Pinocchio's order; see ``pseudo_inertia`` for the source.
-    """
+    """Return the ten symmetric matrices B_k with J(pi) = sum_k pi_k B_k, shape (10, 4, 4)."""
     basis = np.zeros((10, 4, 4))
     basis[0, 3, 3] = 1.0
     for axis in range(3):
@@ -284,13 +262,10 @@ def pseudo_inertia_basis() -> Array:
 
 
 def pseudo_inertia(pi: Array) -> Array:
-    """Return the pseudo-inertia J = [[Sigma, m c], [(m c)^T, m]] of each of n bodies, (n, 4, 4).
+    """Return J = [[Sigma, m c], [(m c)^T, m]] of each of n bodies, (n, 4, 4).
 
-    A body is physically consistent if and only if J is positive semidefinite.
-
-    References:
-        Wensing, Kim, Slotine (2018), Linear Matrix Inequalities for Physically Consistent
-        Inertial Parameter Identification, (8).
+    A body is physically consistent if and only if J is positive semidefinite: Wensing, Kim, Slotine
+    (2018), Linear Matrix Inequalities for Physically Consistent Inertial Parameter Identification.
     """
     return np.asarray(np.einsum("nk,kij->nij", _by_body(pi), pseudo_inertia_basis()))
 

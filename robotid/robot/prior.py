@@ -1,8 +1,4 @@
-"""What is assumed of a robot before its logs: boxes for missing inertials, plausible deviations.
-
-A uniform box is assumed for a body whose inertial the URDF does not state in a usable way. The
-prior is the URDF's parameters and their plausible deviations.
-"""
+"""What is assumed of a robot before its logs: boxes for missing inertials, plausible deviations."""
 
 from collections import Counter
 from dataclasses import replace
@@ -41,10 +37,9 @@ _FARTHEST = 30.0  # RMS distance of the mass from the joint over that box; in mm
 def prior_spread(model: RobotModel, squares: Array, samples: int) -> Array:
     """Return the prior standard deviation of each standard parameter, (p,): squares (3, n_rows).
 
-    That of a body is its own size: its mass m, m r and m r^2, with r the distance of the centre of
-    mass plus the radius of gyration. That of a drive term is the value with which it alone would
-    have the RMS of the measured torque: rms(tau) over the RMS of its column; for an armature at
-    least the inertia of the bodies about its joint.
+    That of a body is its mass m, m r and m r^2, with r the distance of the centre of mass plus the
+    radius of gyration. That of a drive term is rms(tau) over the RMS of its column; for an armature
+    at least the inertia of the bodies about its joint.
     """
     rms = np.sqrt(squares / max(samples, 1))
     return np.concatenate([_inertial_spread(model), _drive_spread(model, rms)])
@@ -89,12 +84,9 @@ def _drive_spread(model: RobotModel, rms: Array) -> Array:
 def with_assumed_inertials(model: RobotModel) -> RobotModel:
     """Return the robot with uniform boxes for the bodies that the URDF states in no usable way.
 
-    These are bodies without mass, with an inertia that no body can have (they keep mass and centre
-    of mass), with an isotropic inertial that three or more links share, and all bodies if the
-    masses or lengths of the robot have a wrong unit. The box is that of the body's geometry, or of
-    its frames if it has none; its density is the median of the other bodies, or 1000 kg/m^3. A
-    massless body without geometry that carries another one in the same place, as between the axes
-    of a ball joint, remains as it is beside bodies with mass.
+    The box is that of the body's geometry, or of its frames if it has none; its density is the
+    median of the other bodies, or 1000 kg/m^3. An inertia that no body can have keeps mass and
+    centre. A massless body between the axes of a ball joint remains as it is.
     """
     size, bodies = model.layout.n_inertial, model.layout.bodies
     pi = model.standard_parameters()[:size]

@@ -1,24 +1,33 @@
-"""The only parser of URDFs in the package: links, inertials and joints.
-
-Pinocchio's parser requires valid geometry, limits and ``<dynamics>``, which the dynamics do not
-use, and only prints its errors. So the XML is read here, each relevant fault raises an error, and
-Pinocchio receives only the kinematic tree, with the numbers read here.
-"""
+"""The only parser of URDFs: each fault raises an error; Pinocchio receives the tree alone."""
 
 import copy
 import difflib
+import logging
 import math
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from decimal import Decimal
+from itertools import chain
 from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from robotid.base.exceptions import ModelError
+from robotid.base.files import DEEPEST, LONGEST_PATH, missing_file
 from robotid.base.findings import listed
-from robotid.robot.urdf_text import LARGEST, parse_urdf, read_numbers, write_exact_angles
 
+#: Largest absolute value of numbers, SI units: squares and products of them stay finite.
+LARGEST = 1e9
+_BLANKS = " \t\n\r\f\v"  # that separate numbers
+_NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_MOST_BYTES = 2**26  # of a file; that of a robot with a thousand links has 2**20
+_EXACT = 1e-7  # [rad] an angle within this of a multiple of pi/12 counts as exact
+_NEAR = 2e-5  # [rad] one within this (0.001 degrees) counts as rounded, not as calibrated
 #: The types of joint that have a degree of freedom.
 MOVABLE = ("revolute", "continuous", "prismatic")
 #: Smallest distance of axes, and side of a body [m]: URDFs have 0.05 m or more, or 0.5 mm.
@@ -40,6 +49,15 @@ class Inertial:
     com: tuple[float, ...]  # centre of mass in the link frame [m]
     rpy: tuple[float, ...]  # roll, pitch, yaw of the frame of the inertia [rad]
     inertia: tuple[float, ...]  # ixx ixy ixz iyy iyz izz about the centre of mass [kg m^2]
+
+    @property
+    def xml(self) -> str:
+        """Its element in a URDF."""
+        moments = " ".join(f'{key}="{x!r}"' for key, x in zip(MOMENTS, self.inertia, strict=True))
+        return (
+            f'<inertial>{_origin(self.com, self.rpy)}<mass value="{self.mass!r}"/>'
+            f"<inertia {moments}/></inertial>"
+        )
 
 
 @dataclass(frozen=True)
@@ -67,11 +85,21 @@ class Joint:
 
     @property
     def has_limits(self) -> bool:
-        """Whether the URDF states a range of positions.
-
-        lower = upper = 0 counts as none, and so does a range of 200 rad or more.
-        """
+        """Whether the URDF states a range of positions; 0 and 200 rad or more count as none."""
         return 0.0 < self.upper - self.lower < _ENDLESS
+
+    @property
+    def xml(self) -> str:
+        """Its element in a URDF without limits, which Pinocchio requires and does not use."""
+        motion = (
+            f'<axis xyz="{" ".join(map(repr, self.axis))}"/>'
+            '<limit lower="-1e9" upper="1e9" velocity="1e9" effort="1e9"/>'
+        )
+        return (
+            f'<joint name={quoteattr(self.name)} type="{self.type}">{_origin(self.xyz, self.rpy)}'
+            f"<parent link={quoteattr(self.parent)}/><child link={quoteattr(self.child)}/>"
+            f"{motion if self.is_movable else ''}</joint>"
+        )
 
     @property
     def turns_freely(self) -> bool:
@@ -119,20 +147,24 @@ class Tree:
     @property
     def xml(self) -> str:
         """A URDF with only the links, inertials and joints, with the numbers read here."""
-        minimal = ET.Element("robot", name=self.name)
-        for link in self.links:
-            element = ET.SubElement(minimal, "link", name=link)
-            if link in self.inertials:
-                _add_inertial(element, self.inertials[link])
-        for joint in self.joints:
-            _add_joint(minimal, joint)
-        return ET.tostring(minimal, encoding="unicode")
+        inertials = {link: inertial.xml for link, inertial in self.inertials.items()}
+        links = [f"<link name={quoteattr(x)}>{inertials.get(x, '')}</link>" for x in self.links]
+        joints = [joint.xml for joint in self.joints]
+        return f"<robot name={quoteattr(self.name)}>{''.join([*links, *joints])}</robot>"
 
     def snapped(self) -> "Tree":
         """Return the same robot with exact angles for the rounded ones of its joints' origins."""
         robot = copy.deepcopy(self.robot)
-        write_exact_angles(robot)
+        for origin in robot.iterfind("joint/origin[@rpy]"):
+            words = origin.get("rpy", "").split()
+            exact = [exact_angle(word) for word in words]
+            pairs = zip(words, exact, strict=True)
+            origin.set("rpy", " ".join(word if x is None else repr(x) for word, x in pairs))
         return _tree(robot, self.path)
+
+
+def _origin(xyz: Sequence[float], rpy: Sequence[float]) -> str:
+    return f'<origin xyz="{" ".join(map(repr, xyz))}" rpy="{" ".join(map(repr, rpy))}"/>'
 
 
 def read_tree(path: str | Path) -> Tree:
@@ -267,29 +299,6 @@ def _inertial(inertial: ET.Element, at: str) -> Inertial:
     return Inertial(value, com, rpy, moments)
 
 
-def _text(values: Sequence[float]) -> str:
-    return " ".join(map(repr, values))
-
-
-def _add_inertial(link: ET.Element, inertial: Inertial) -> None:
-    element = ET.SubElement(link, "inertial")
-    ET.SubElement(element, "origin", xyz=_text(inertial.com), rpy=_text(inertial.rpy))
-    ET.SubElement(element, "mass", value=repr(inertial.mass))
-    moments = dict(zip(MOMENTS, map(repr, inertial.inertia), strict=True))
-    ET.SubElement(element, "inertia", moments)
-
-
-def _add_joint(robot: ET.Element, joint: Joint) -> None:
-    element = ET.SubElement(robot, "joint", name=joint.name, type=joint.type)
-    ET.SubElement(element, "origin", xyz=_text(joint.xyz), rpy=_text(joint.rpy))
-    ET.SubElement(element, "parent", link=joint.parent)
-    ET.SubElement(element, "child", link=joint.child)
-    if joint.is_movable:
-        ET.SubElement(element, "axis", xyz=_text(joint.axis))
-        # the parser requires limits; the dynamics do not use them, `Joint` has the stated ones
-        ET.SubElement(element, "limit", lower="-1e9", upper="1e9", velocity="1e9", effort="1e9")
-
-
 def choose_joints(
     tree: Tree,
     free: Sequence[str],
@@ -392,4 +401,147 @@ def _check_mimic(
             raise ModelError(
                 f"joint {joint.name!r} mimics {leader!r}, but only one of them is locked; list "
                 "both in joints, or lock both, or use mimic = 'coupled'"
+            )
+
+
+def parse_urdf(path: str | Path) -> ET.Element:
+    """Return the ``<robot>`` of a URDF file, without checking its content."""
+    path = Path(path)
+    if path.suffix == ".xacro":
+        raise ModelError(f"{path.name} is xacro, not URDF; expand it first: xacro {path.name}")
+    try:
+        if not path.is_file():  # folders, pipes and devices are not read
+            raise ModelError(missing_file(path, "URDF file"))
+        size, content = path.stat().st_size, b""
+        if size <= _MOST_BYTES:
+            content = path.read_bytes()
+    except OSError as error:
+        raise ModelError(f"{_shown(str(path))} cannot be read: {error.strerror}") from error
+    if size > _MOST_BYTES:
+        raise ModelError(
+            f"{path.name} has {size / 2**20:.0f} MiB, wanted a URDF of at most "
+            f"{_MOST_BYTES // 2**20} MiB; move meshes and logs to separate files"
+        )
+    if b"<!ENTITY" in content:  # a few of them can expand beyond the memory
+        raise ModelError(
+            f"{path.name} declares XML entities, which other URDF parsers do not support; replace "
+            "them by their text"
+        )
+    try:
+        robot = _parsed(content)
+    except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two: its encoding
+        raise ModelError(
+            f"{path.name} is not well-formed XML: {error}; wanted a URDF file"
+        ) from error
+    if robot.tag != "robot":
+        raise ModelError(
+            f"{path.name}: the top element is <{robot.tag[:LONGEST_PATH]}>, wanted <robot>"
+        )
+    _check_bounds(robot, path.name)
+    return robot
+
+
+def _parsed(content: bytes) -> ET.Element:
+    """Return the top element; prefixes of names, as sensor:camera, need no declaration."""
+    builder, parser = ET.TreeBuilder(), expat.ParserCreate()
+    parser.buffer_text = True
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.CharacterDataHandler = builder.data
+    parser.Parse(content, True)  # as a whole: in parts a long name takes quadratic time
+    return builder.close()
+
+
+def numbers(text: str, count: int, most: float = LARGEST) -> tuple[float, ...]:
+    """Return the numbers of an attribute, none if it is not valid."""
+    words = re.findall(f"[^{_BLANKS}]+", text)
+    if len(words) != count or not all(map(_NUMBER.fullmatch, words)):
+        return ()
+    values = tuple(map(float, words))
+    is_usable = all(math.isfinite(x) and abs(x) <= most for x in values)
+    return values if is_usable else ()
+
+
+def number_fault(element: ET.Element, key: str) -> str | None:
+    """Return the fault of an attribute that must be numbers, None if there is none."""
+    text, (count, most) = element.get(key), _wanted(element, key)
+    if text is not None and numbers(text, count, most):
+        return None
+    found = "missing" if text is None else _shown(text)
+    kind = "finite number" if math.isinf(most) else "number"
+    amount = f"one {kind}" if count == 1 else f"{count} {kind}s separated by blanks"
+    bound = "" if math.isinf(most) else f" within +-{most:g}"
+    return f"{element.tag} {key} is {found}, wanted {amount}{bound}, written like 0.25 or 2.5e-1"
+
+
+def read_numbers(
+    element: ET.Element | None, key: str, at: str, default: tuple[float, ...] = ()
+) -> tuple[float, ...]:
+    """Return the numbers of an attribute."""
+    if default and (element is None or element.get(key) is None):
+        return default
+    if element is None:
+        raise ModelError(f"{at} has no element with {key}; add it")
+    if fault := number_fault(element, key):
+        raise ModelError(f"{at} {fault}")
+    return numbers(element.get(key, ""), *_wanted(element, key))
+
+
+def exact_angle(word: str) -> float | None:
+    """Return the multiple of pi/12 that an angle approximates, None if it is not a rounded one.
+
+    The multiple, rounded or truncated to the angle's decimals (two for pi/2, else four), is equal
+    to it, as 3.1415; or they are within 2e-5 rad. A calibrated angle, as 1.570912, is none.
+    """
+    values = numbers(word, 1)
+    twelfths = round(values[0] / (math.pi / 12)) if values else 0
+    if twelfths == 0:
+        return None
+    exact = twelfths / 12 * math.pi
+    exponent = Decimal(word.strip()).normalize().as_tuple().exponent
+    decimals = -exponent if isinstance(exponent, int) else 0
+    unit, gap = 10.0**-decimals, abs(exact) - abs(values[0])
+    is_rounded = -0.5 * unit <= gap < unit and decimals >= (2 if twelfths % 6 == 0 else 4)
+    return exact if abs(gap) > _EXACT and (is_rounded or abs(gap) < _NEAR) else None
+
+
+def read_with_yourdfpy(path: str | Path) -> Any:  # noqa: ANN401
+    """Read a URDF with yourdfpy, a reader independent of this package's."""
+    import yourdfpy
+
+    logging.getLogger("yourdfpy").addHandler(logging.NullHandler())  # its messages are not needed
+    try:
+        return yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
+    except Exception as error:  # it checks nothing, so a faulty file raises errors of any kind
+        fault = f"{type(error).__name__}: {error}"
+        raise ModelError(f"yourdfpy cannot read {Path(path).name}: {fault}") from error
+
+
+def _wanted(element: ET.Element, key: str) -> tuple[int, float]:
+    """Return the number of an attribute's numbers, and their largest absolute value."""
+    # limits and damping do not affect the dynamics; some exporters write 1e308 for "no limit"
+    most = math.inf if element.tag in ("limit", "dynamics") else LARGEST
+    return 3 if key in ("xyz", "rpy") else 1, most
+
+
+def _shown(text: str) -> str:
+    return repr(text if len(text) <= 80 else f"{text[:77]}...")
+
+
+def _check_bounds(robot: ET.Element, where: str) -> None:
+    """Raise if elements are nested too deep or attributes are too long."""
+    level, depth = [robot], 0
+    while level:
+        level, depth = [child for element in level for child in element], depth + 1
+        if depth > DEEPEST:
+            raise ModelError(
+                f"{where}: elements are nested {depth} levels deep, wanted at most {DEEPEST}; a "
+                "URDF needs six"
+            )
+    owners = chain([robot], *(o.iter() for tag in ("link", "joint") for o in robot.iterfind(tag)))
+    for element, key, text in ((x, *item) for x in owners for item in x.items()):
+        if len(text) > LONGEST_PATH:
+            raise ModelError(
+                f"{where}: <{element.tag[:80]}>: {key[:80]} has {len(text)} characters, wanted at "
+                f"most {LONGEST_PATH}; it starts with {_shown(text)}"
             )

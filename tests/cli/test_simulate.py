@@ -8,10 +8,10 @@ import pytest
 
 from robotid.base.files import file_sha256
 from robotid.cli import main
+from robotid.cli.identify import identify
 from robotid.data.files.read import read_log, write_columns
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.motions import SampledMotion, random_fourier
-from robotid.identification.pipeline import identify
 from robotid.output.files.urdf import load_identified
 from robotid.robot.examples import example_urdf
 

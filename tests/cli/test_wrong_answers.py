@@ -10,12 +10,11 @@ import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
-from robotid.cli.identify import run_job
+from robotid.cli.identify import identify, run_job
 from robotid.cli.job import job_from_settings, read_job
 from robotid.data.files.read import read_log, write_log
 from robotid.dynamics.prediction import predict
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.identification.pipeline import identify
 from robotid.output.files.urdf import load_identified, write_urdf
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

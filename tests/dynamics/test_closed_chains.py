@@ -8,6 +8,7 @@ import pytest
 
 from robotid.base.exceptions import DataError, ModelError
 from robotid.base.text import seconds
+from robotid.cli.identify import identify
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
@@ -19,7 +20,6 @@ from robotid.dynamics.constraint_rows import (
 )
 from robotid.dynamics.prepared_logs import closed_log
 from robotid.dynamics.torque import joint_torque_regressor, random_regressor
-from robotid.identification.pipeline import identify
 from robotid.robot.closure import Chains
 from robotid.robot.constraints import Contact, Loop
 from robotid.robot.drives import TERMS, Spring
@@ -243,6 +243,10 @@ def test_a_log_in_another_order_keeps_each_joint_and_names_the_loop_that_is_open
     )
     assert f"at most {0.02 * robot.length:.2g} m" in str(error.value)
     assert gaps[13:, 0].max() < 1e-9
+    data, ids = robot.pin_model.createData(), map(robot.pin_model.getFrameId, robot.loops[1].frames)
+    pin.framesForwardKinematics(robot.pin_model, data, robot.configurations(moved[13:14])[0])
+    rod, heel = (data.oMf[k].translation for k in ids)
+    assert gaps[13, 1] == pytest.approx(np.linalg.norm(rod - heel), rel=1e-9)
     assert [Chains(robot).is_closed(x) for x in moved[[12, 13]]] == [True, False]
 
 

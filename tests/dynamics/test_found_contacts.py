@@ -13,10 +13,7 @@ from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.constraint_rows import constraint_jacobian
 from robotid.dynamics.prediction import predict_instants
-from robotid.dynamics.prepared_logs import (
-    find_contacts,
-    with_contacts,
-)
+from robotid.dynamics.prepared_logs import find_contacts, with_contacts
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -61,12 +58,11 @@ def test_forces_at_rest_are_found(robot):
     every = np.ones((200, 4), dtype=bool)
     log, forces, rest = standing(robot, every)
     assert np.abs(rest).max() < 1e-9  # the feet bear the weight
-    t, found = find_contacts(robot, log, RAW)
+    t, frames, touches, force = find_contacts(robot, log, RAW)
     np.testing.assert_allclose(t, log.t)
-    assert [x.frame for x in found] == list(FEET)
-    for k, contact in enumerate(found):
-        np.testing.assert_allclose(contact.force, forces[:, k], atol=1e-3)
-        assert contact.shares == pytest.approx((1.0, 0.0, 0.0))
+    assert frames == list(FEET)
+    np.testing.assert_allclose(force, forces, atol=1e-3)
+    assert touches.min() > 0.98
 
 
 def test_feet_without_load_are_found(robot):
@@ -74,11 +70,11 @@ def test_feet_without_load_are_found(robot):
     loaded[60:300, 2] = loaded[300:, 3] = False  # the one is in the air for most of the time
     log, _, rest = standing(robot, loaded)
     assert np.abs(rest).max() < 1e-9
-    _, found = find_contacts(robot, log, RAW)
-    for contact, own in zip(found, loaded.T, strict=True):
-        np.testing.assert_array_equal(contact.touches > 0.98, own)
-        np.testing.assert_array_equal(contact.touches < 0.02, ~own)
-        lifted = contact.force[~own]  # the acceleration jumps at two samples of either end
+    _, _, touches, force = find_contacts(robot, log, RAW)
+    np.testing.assert_array_equal(touches > 0.98, loaded)
+    np.testing.assert_array_equal(touches < 0.02, ~loaded)
+    for lifted in (force[60:300, 2], force[300:, 3]):
+        # the acceleration jumps at two samples of either end
         np.testing.assert_allclose(lifted[2:-2], 0.0, atol=1e-3)
     stated = {"FR_FOOT": loaded[:, 1], "FL_FOOT": loaded[:, 0]}
     full = with_contacts(robot, replace(log, contacts=stated), RAW)
@@ -117,19 +113,18 @@ def test_contacts_of_a_trot_agree_with_stated_ones(recordings, monkeypatch):
     job = read_job(JOBS / "legged" / "solo12.toml")
     model = job.model()
     log = job.read(job.identification[0], model)
-    t, found = find_contacts(model, replace(log, contacts={}), job.signals)
-    for contact in found:
-        stated = log.contacts[contact.frame][np.searchsorted(log.t, t - 1e-9)]
-        on, off, undecided = contact.shares
-        assert undecided < 0.04
-        decided = np.abs(contact.touches - 0.5) > 0.48
-        assert np.mean((contact.touches > 0.5)[decided] == stated[decided]) > 0.975
-        assert min(on, off) > 0.2
+    t, frames, touches, _ = find_contacts(model, replace(log, contacts={}), job.signals)
+    is_decided = np.abs(touches - 0.5) > 0.48
+    assert (is_decided.mean(axis=0) > 0.96).all()
+    for frame, p, decided in zip(frames, touches.T, is_decided.T, strict=True):
+        stated = log.contacts[frame][np.searchsorted(log.t, t - 1e-9)]
+        assert np.mean((p > 0.5)[decided] == stated[decided]) > 0.975
+        assert min(np.mean(p > 0.98), np.mean(p < 0.02)) > 0.2
     # without the position of the base, the feet on the ground show how fast it moves
     pose, twist = log.base.pose * np.repeat([0, 1], [3, 4]), log.base.twist * np.repeat([0, 1], 3)
     blind = replace(log, contacts={}, base=BaseMotion(pose, twist))
-    _, found = find_contacts(model, blind, job.signals)
-    assert sum(contact.shares[2] for contact in found) < 0.06
+    _, _, touches, _ = find_contacts(model, blind, job.signals)
+    assert np.sum(np.abs(touches - 0.5) <= 0.48) < 0.06 * len(touches)
 
 
 @pytest.mark.parametrize("axes", ["world", "link"])
@@ -149,8 +144,8 @@ def test_forces_are_found_beside_a_measured_one_whatever_is_up(robot, axes):
     own = constraint_jacobian(model, q, every)
     measured = np.linalg.lstsq(own[0, 3:6].T, J[0, 3:6].T @ f[3:6], rcond=None)[0]
     wrenches = {f"f{x} FR_FOOT": np.full(60, y) for x, y in zip("xyz", measured, strict=True)}
-    _, found = find_contacts(model, replace(log, wrenches=wrenches), RAW)
+    _, frames, _, force = find_contacts(model, replace(log, wrenches=wrenches), RAW)
     up = np.array([-2.0, 1.0, 9.4]) / np.linalg.norm([-2.0, 1.0, 9.4])
-    assert [x.frame for x in found] == [FEET[0], FEET[2], FEET[3]]
-    for contact, k in zip(found, (0, 2, 3), strict=True):
-        np.testing.assert_allclose(contact.force, f[3 * k : 3 * k + 3] @ up, rtol=2e-3)
+    assert frames == [FEET[0], FEET[2], FEET[3]]
+    wanted = f.reshape(4, 3)[[0, 2, 3]] @ up
+    np.testing.assert_allclose(force, np.tile(wanted, (60, 1)), rtol=2e-3)

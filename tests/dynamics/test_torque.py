@@ -6,13 +6,11 @@ from robotid.base.exceptions import DataError
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import Transmission
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.problem import Sample, concatenate, shuffled
-from robotid.dynamics.simulation.truth import another_robot
+from robotid.dynamics.problem import Sample, shuffled
 from robotid.dynamics.torque import (
     InstantRegressor,
     build_problem,
     joint_torque_regressor,
-    mass_regressor,
     random_regressor,
 )
 from robotid.robot.examples import example_urdf
@@ -150,33 +148,6 @@ def test_the_regressor_of_one_instant_is_that_of_many(robot, request, rng):
     expected = joint_torque_regressor(model, q, v, a).reshape(5, n, p)[..., columns]
     for k in range(5):
         np.testing.assert_allclose(instant(q[k], v[k], a[k]), expected[k], atol=1e-14)
-
-
-def test_the_mass_regressor_gives_the_mass_matrix_with_armature(ur5, rng):
-    pi = another_robot(ur5, rng)
-    q = rng.uniform(-1, 1, (4, 6))
-    D = mass_regressor(ur5, q) @ pi
-    other = ur5.with_parameters(pi).pin_model
-    armature = [pi[ur5.layout.names.index(f"{j}.armature")] for j in ur5.joints]
-    for k in range(4):
-        M = pin.crba(other, other.createData(), q[k])
-        M = np.triu(M) + np.triu(M, 1).T + np.diag(armature)
-        np.testing.assert_allclose(D[k], M, atol=1e-12 * np.abs(M).max())
-
-
-def test_a_problem_carries_the_mass_regressor_through_selection_and_concatenation(ur5, rng):
-    q, v, a = rng.uniform(-1, 1, (3, 7, 6))
-    t = np.arange(7.0)
-    trajectory = Trajectory(t, q, v, a, a, ur5.joints, None, np.zeros(7, dtype=int))
-    problem = build_problem(ur5, trajectory, with_mass=True)
-    chosen = concatenate([problem.select(np.array([3, 5]))] * 2)
-    samples = list(chosen.samples())
-    assert len(samples) == 14
-    D = mass_regressor(ur5, q)[..., [3, 5]]
-    np.testing.assert_array_equal(samples[8].mass_regressor, D[1])
-    plain = build_problem(ur5, trajectory)
-    assert next(concatenate([problem, plain]).samples()).mass_regressor is None
-    assert next(plain.select(np.array([3])).samples()).mass_regressor is None
 
 
 def test_samples_are_shuffled_without_loss(rng):

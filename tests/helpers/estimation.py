@@ -10,7 +10,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.problem import Problem
-from robotid.dynamics.torque import build_problem, joint_torque_regressor, mass_regressor
+from robotid.dynamics.torque import build_problem, joint_torque_regressor
 from robotid.estimation.estimators import (
     OLS,
     PRX,
@@ -33,7 +33,7 @@ class Case:
     def __init__(self, model, rng, noise=None, **options):
         log = exact_log(model, truth(model), rng, noise=noise, **options)
         self._describe(model, process(log, EXACT), noise)
-        self.problem = self.mapping.reduce(build_problem(model, self.trajectory, with_mass=True))
+        self.problem = self.mapping.reduce(build_problem(model, self.trajectory))
 
     def _describe(self, model, trajectory, noise):
         self.model, self.trajectory = model, trajectory
@@ -65,10 +65,8 @@ class RandomStates(Case):
         self._describe(model, Trajectory(t, q, v, a, tau, model.joints, 50.0, segment), None)
         columns = self.mapping.independent
         block = (W[:, columns], W[:, columns] @ self.beta, np.ones(len(W)))
-        mass, support = mass_regressor(model, q)[..., columns], model.support[:, columns]
-        self.problem = Problem(
-            lambda: iter([block]), self.mapping.base_names, n, support, lambda: iter([mass])
-        )
+        names, support = self.mapping.base_names, model.support[:, columns]
+        self.problem = Problem(lambda: iter([block]), names, n, support)
 
 
 def consistent(case, **options):

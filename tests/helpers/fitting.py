@@ -3,18 +3,18 @@
 ``fit`` is the fit alone, without what is concluded from it.
 """
 
+from robotid.cli.identify import identify as identify_all
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.fit import fit_recordings
 from robotid.estimation.fitting.recorded import Recordings, hold_log
-from robotid.identification import pipeline
 
 PLAIN = {"doctor": False, "friction": "viscous+coulomb"}  # what tests of fits do not read
 
 
 def identify(model, logs, **settings):
-    return pipeline.identify(model, logs, **{**PLAIN, **settings})
+    return identify_all(model, logs, **{**PLAIN, **settings})
 
 
 def fit(model, logs, *, validation=(), signals=None, estimator="consistent"):

@@ -186,4 +186,4 @@ def run_call(example, folder):
 
 
 #: By name: a strategy of examples, and what is done with one in an empty folder.
-ARGUMENT_KINDS = {"Python arguments": (calls, (), run_call)}
+ARGUMENT_KINDS = {"Python arguments": (calls(), run_call)}

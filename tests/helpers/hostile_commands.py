@@ -6,6 +6,7 @@ As those of ``hostile_inputs``, whose ``KINDS`` these are beside.
 import json
 import shutil
 import tempfile
+import xml.etree.ElementTree as ET
 from functools import cache, partial
 from pathlib import Path
 
@@ -17,20 +18,24 @@ from hypothesis import strategies as st
 from helpers.hostile_inputs import (
     JOINTS,
     MARKUP,
+    MILD_OF,
     URDF,
     columns,
     edited,
+    edits,
     good_log,
     good_result,
     obey,
     places,
     plain,
+    rarely,
     replacements,
+    run_job,
+    settings_of,
     toml_file,
-    values,
     write_csv,
 )
-from helpers.hostile_urdfs import any_of
+from helpers.hostile_urdfs import HostileUrdf, any_of, robots, write_urdf_files
 from helpers.recorders import write_lerobot
 from robotid.data.files.read import write_log
 from robotid.data.log import Log
@@ -38,15 +43,9 @@ from robotid.dynamics.simulation.simulation_settings import Simulation
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.robot.drives import FAMILIES
 
-__all__ = ["COMMAND_KINDS"]
-
-# --- what is spoilt ------------------------------------------------------------------------------
-
-
-def edits(found, new=replacements, most=2):
-    """Return a strategy of what is done with values at some of the places of a JSON value."""
-    actions = st.sampled_from(["put", "put", "drop", "add"])
-    return st.lists(st.tuples(st.sampled_from(found), actions, new), max_size=most)
+numbers = any_of("0 -1 1 2 0.5 1e-9 1e-300 1e9 1e300 100000 nan inf x") | st.just("")
+wild = numbers | any_of("1e6 1e-6 0.1 10 1e12")
+of_joint = st.tuples(st.sampled_from([*JOINTS, *JOINTS, "x", ""]), wild).map("=".join)
 
 
 def flagged(pairs):
@@ -54,50 +53,8 @@ def flagged(pairs):
     return [word for pair in pairs for word in pair]
 
 
-numbers = any_of("0 -1 1 2 0.5 1e-9 1e-300 1e9 1e300 100000 nan inf x") | st.just("")
-
 # --- robotid excite ------------------------------------------------------------------------------
 
-#: Robots of few joints: two that cannot touch themselves, one that slides, one without limits.
-ROBOTS = {
-    "two links": "",
-    "pan and tilt": """
-        <joint name="joint_1" type="revolute"><parent link="base"/><child link="pan"/>
-          <axis xyz="0 0 1"/><limit lower="-2" upper="2" velocity="2" effort="20"/></joint>
-        <joint name="joint_2" type="revolute"><parent link="pan"/><child link="tilt"/>
-          <origin xyz="0 0 0.1"/><axis xyz="0 1 0"/>
-          <limit lower="-1" upper="1" velocity="2" effort="20"/></joint>""",
-    "slide": """
-        <joint name="joint_1" type="prismatic"><parent link="base"/><child link="pan"/>
-          <axis xyz="0 0 1"/><limit lower="0" upper="0" velocity="2" effort="20"/></joint>
-        <joint name="joint_2" type="continuous"><parent link="pan"/><child link="tilt"/>
-          <axis xyz="0 1 0"/><limit velocity="1e-6" effort="0.01"/></joint>""",
-    "no limits": """
-        <joint name="joint_1" type="continuous"><parent link="base"/><child link="pan"/>
-          <axis xyz="0 0 1"/></joint>
-        <joint name="joint_2" type="fixed"><parent link="pan"/><child link="tilt"/></joint>""",
-    "nothing moves": """
-        <joint name="joint_1" type="fixed"><parent link="base"/><child link="pan"/></joint>
-        <joint name="joint_2" type="fixed"><parent link="pan"/><child link="tilt"/></joint>""",
-}
-_LINK = """<link name="{name}"><inertial><mass value="{mass}"/><origin xyz="0.05 0 0.02"/>
-  <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>
-  <collision><geometry><box size="0.1 0.05 0.05"/></geometry></collision></link>"""
-
-
-def robot_file(name, mass, folder):
-    """Return the URDF of one of the robots."""
-    if not ROBOTS[name]:
-        return URDF
-    links = _LINK.format(name="base", mass=1) + _LINK.format(name="pan", mass=mass)
-    links += _LINK.format(name="tilt", mass=mass)
-    path = folder / "robot.urdf"
-    path.write_text(f'<robot name="r">{links}{ROBOTS[name]}</robot>', encoding="utf-8")
-    return path
-
-
-wild = numbers | any_of("1e6 1e-6 0.1 10 1e12")
-of_joint = st.tuples(st.sampled_from([*JOINTS, *JOINTS, "x", ""]), wild).map("=".join)
 #: What a flag may be, to its ends.
 RANGED = {
     "--duration": ["0.1", "0.5", "1", "600", "3600"],
@@ -115,37 +72,31 @@ RANGED = {
 BOXES = ["a=-1,-1,-1,1,1,1", "=0,0,0,0,0,0", f"{MARKUP}=2,2,2,3,3,3", "a=1,1,1,0,0,0", "a=nan"]
 
 
-def ranged(table):
-    """Return a strategy of flags with arguments that a table names."""
-    return st.sampled_from([(flag, word) for flag, some in table.items() for word in some])
-
-
+ranged = st.sampled_from([(flag, word) for flag, some in RANGED.items() for word in some])
 excite_flags = st.one_of(
-    ranged(RANGED),
-    ranged(RANGED),
+    ranged,
+    ranged,
     st.tuples(st.sampled_from([*sorted(RANGED), "--seed", "--gain"]), numbers),
     st.tuples(any_of("--max-acceleration --max-jerk --max-power --noise --lock"), of_joint),
     st.tuples(st.just("--box"), st.sampled_from(BOXES)),
+    st.tuples(st.just("--kind"), any_of("fourier sweeps stands")),
 )
-kinds = st.sampled_from([["--kind", kind] for kind in ("fourier", "sweeps", "stands")])
 excitements = st.tuples(
-    st.sampled_from([*["pan and tilt"] * 5, *sorted(ROBOTS)]),
-    st.sampled_from([*["1"] * 8, "0", "1e-12", "1e9", "nan"]),  # masses [kg]
+    st.just(Path(URDF).read_bytes()) | robots().map(ET.tostring),
     st.sampled_from([".csv"] * 8 + [".parquet", ".yaml", ".script", ".txt", ""]),
-    kinds,
-    st.lists(excite_flags, max_size=3),
+    st.lists(excite_flags, max_size=4),
 )
 
 
 def run_excite(example, folder):
-    robot, mass, suffix, kind, given = example
+    robot, suffix, given = example
     given = [(flag, str(good_result()[0]) if x == "RESULT" else x) for flag, x in given]
-    urdf, out = robot_file(robot, mass, folder), folder / "made"
+    urdf, out = write_urdf_files(HostileUrdf(robot), folder), folder / "made"
     out.mkdir()
     quick = ["--starts", "1", "--seconds", "0.2", "--harmonics", "2", "--duration", "3"]
     obey(
         "excite", urdf, "--out", out / f"motion{suffix}", "--report", out / "page.html",
-        *quick, *kind, *flagged(given), out=out,
+        *quick, *flagged(given), out=out,
     )  # fmt: skip
     page = out / "page.html"
     if page.exists():
@@ -155,66 +106,19 @@ def run_excite(example, folder):
 # --- robotid simulate ----------------------------------------------------------------------------
 
 
-def keys_of(schema, prefix=()):
-    """Yield the path and the kind of every key of a schema that is no table of its own."""
-    for key, kind in schema.items():
-        if isinstance(kind, dict):
-            yield from keys_of(kind, (*prefix, key))
-        else:
-            yield (*prefix, key), kind
-
-
-#: What the settings of a kind may be, to their ends.
-MILD = {
-    bool: st.booleans(),
-    str: any_of("usual none pd feedforward computed_torque perfect joint motor torque find urdf "
-                "one group link_1 link_2"),
-    float: st.sampled_from([0, 1e-9, 1e-3, 0.05, 0.5, 1, 1.0, 5.0, 30.0, 1e3, 1e5, 1e9, 1e12]),
-    list: st.sampled_from([[0.0, 0.0, 0.1], [1.0, 0.0, 1.0, 0.0, 0.0, 1.0], [1e9] * 6, [JOINTS]]),
-}  # fmt: skip
-NAMES = st.sampled_from([*JOINTS, *JOINTS, "x", "joint_1.viscous", "link_1.mass"])
-MILD[dict] = st.dictionaries(NAMES, MILD[float] | plain, max_size=3)
-
-
-def mild(kind):
-    """Return a strategy of values of the kind that a key of a schema has."""
-    outer = getattr(kind, "outer", None)
-    some = [outer] if outer is not None else kind if isinstance(kind, tuple) else [dict]
-    return st.one_of(*(MILD[float if one is int else one] for one in some))
-
-
-@st.composite
-def settings_of(draw, schema):
-    """A table of a schema with some values, most of the right kind."""
-    table = {}
-    for path, kind in draw(st.lists(st.sampled_from(list(keys_of(schema))), max_size=3)):
-        inside = table
-        for key in path[:-1]:
-            inside = inside.setdefault(key, {})
-        inside[path[-1]] = draw(mild(kind) if draw(st.integers(0, 9)) else values)
-    return table
-
-
-numeric_flags = any_of(
-    "--seed --rate --duration --perturb --torque-noise --limits --payload --cutoff"
-)
 simulate_flags = st.one_of(
-    st.tuples(numeric_flags, wild),
+    st.tuples(any_of("--seed --rate --duration --perturb --torque-noise --limits --payload"), wild),
     st.tuples(st.just("--controller"), any_of("pd feedforward computed_torque perfect x")),
     st.tuples(st.just("--joints"), st.sampled_from(["joint_1", "joint_2,joint_1", "x", ""])),
     st.tuples(st.just("--lock"), of_joint),
 )
-
-
-def simulations():
-    """Tables of a plant, flags, a motion or None for a good one, and what is written."""
-    motion = st.none() | columns()
-    return st.tuples(
-        settings_of(Simulation.schema() | {"drives": {"joint_1": (list,)}}),
-        st.lists(simulate_flags, max_size=3),
-        motion,
-        st.sampled_from([".csv", ".csv", ".npz", ".x"]),
-    )
+#: Tables of a plant, flags, a motion or None for a good one, and what is written.
+simulations = st.tuples(
+    settings_of(Simulation.schema() | {"drives": {"joint_1": (list,)}}),
+    st.lists(simulate_flags, max_size=3),
+    st.none() | columns(),
+    st.sampled_from([".csv", ".csv", ".npz", ".x"]),
+)
 
 
 def run_simulate(example, folder):
@@ -246,7 +150,6 @@ def good_dataset():
     return folder, (folder / "meta" / "info.json").read_text(encoding="utf-8")
 
 
-deep = st.integers(50, 3000).map(lambda depth: json.loads("[" * depth + "]" * depth))
 odd_names = st.sampled_from(
     [None, 5, "joint_1", ["joint_1"] * 2, ["joint_1", ["joint_2"]], {"motors": 5}, {"a": {"b": []}},
      [None, None], [""], ["joint_1.pos", "joint_1"], [".pos", ".vel"], ["a\0b", "\ud800"],
@@ -299,16 +202,16 @@ def spoil_dataset(path, what, column):
         "empty": pa.array([[]] * rows, type=pa.list_(pa.float32())),
         "index": pa.array([2**62 + k for k in range(rows)]),
     }
-    if what in other:
-        pq.write_table(table.set_column(place, column, other[what]), path)
-    elif what == "drop":
-        pq.write_table(table.remove_column(place), path)
-    elif what == "no-rows":
-        pq.write_table(table.slice(0, 0), path)
-    elif what == "two-files":
-        pq.write_table(table.remove_column(place), path.with_name("other.parquet"))
+    lacking = table.remove_column(place)
+    if what == "two-files":
+        pq.write_table(lacking, path.with_name("other.parquet"))
     elif what == "bytes":
         path.write_bytes(path.read_bytes()[:200])
+    elif what is not None:
+        changed = {"drop": lacking, "no-rows": table.slice(0, 0)} | {
+            key: table.set_column(place, column, values) for key, values in other.items()
+        }
+        pq.write_table(changed[what], path)
 
 
 # --- tables of drives in a job file --------------------------------------------------------------
@@ -318,7 +221,6 @@ NEEDS = {
     "Ramp": ["number", "low", "high"], "LuGre": ["displacement", "speed", "excess"],
     "Presliding": ["displacement"], "PositionCoulomb": ["order", "centre"], "x": ["speed"],
 }  # fmt: skip
-rarely = st.integers(0, 9).map(lambda n: n == 0)
 
 
 @st.composite
@@ -327,7 +229,7 @@ def drive_terms(draw):
     name = draw(st.sampled_from(sorted(NEEDS)))
     term = {"term": name}
     for key in NEEDS[name]:
-        term[key] = draw(plain if draw(rarely) else MILD[float])
+        term[key] = draw(plain if draw(rarely) else MILD_OF[float])
     if draw(rarely):
         term["data_range"] = draw(st.sampled_from([[0.0, 1.0], [1.0, 0.0], [1.0], ["x"], {}]))
     return term
@@ -359,12 +261,10 @@ couplings = st.fixed_dictionaries(
     },
     optional={"replaces": st.booleans() | plain},
 )
-loops = settings_of(LoopSettings.schema())
-
-
-of_robot = st.sampled_from([*JOINTS, *JOINTS, "x", ""])
 TABLES = {
-    "drives": st.dictionaries(of_robot, drive_lists, min_size=1, max_size=2),
+    "drives": st.dictionaries(
+        any_of("joint_1 joint_2 joint_1 joint_2 x"), drive_lists, min_size=1, max_size=2
+    ),
     "transmission": st.lists(gears | gears | lacking, min_size=1, max_size=2),
     "coupling": st.lists(couplings, min_size=1, max_size=2),
 }
@@ -384,7 +284,7 @@ def loop_jobs(draw):
     """The tables of a job file whose loop is hostile, of one joint: each takes seconds."""
     window = draw(st.sampled_from([0.5, 1.0, 3.0, 1e9, 1e-9]))
     table = {"joints": ["joint_1"], "estimator": {"name": "simulation", "window": window}}
-    table["controller"] = draw(loops)
+    table["controller"] = draw(settings_of(LoopSettings.schema()))
     if draw(rarely):
         name = draw(st.sampled_from(sorted(TABLES)))
         table[name] = draw(TABLES[name])
@@ -395,18 +295,14 @@ def run_drive_job(table, folder, samples=200):
     log = good_log(samples)
     log = Log(log.t, log.q, log.tau, log.joints, log.v, q_ref=log.q)
     table = {"urdf": URDF, "identification": [{"log": "fit.csv"}]} | table
-    table["output"] = {"report": False}
-    write_log(log, folder / "fit.csv")
-    path, out = folder / "job.toml", folder / "out"
-    path.write_text(toml_file(table), encoding="utf-8", errors="replace")
-    obey("identify", path, "--out", out, out=out)
+    run_job(toml_file(table | {"output": {"report": False}}), log, folder)
 
 
 #: By name: a strategy of examples, and what is done with one in an empty folder.
 COMMAND_KINDS = {
-    "excite": (lambda: excitements, (), run_excite),
-    "simulate": (simulations, (), run_simulate),
-    "LeRobot dataset": (datasets, (), run_dataset),
-    "drives of a job": (drive_jobs, (), run_drive_job),
-    "loop of a job": (loop_jobs, (), partial(run_drive_job, samples=80)),
+    "excite": (excitements, run_excite),
+    "simulate": (simulations, run_simulate),
+    "LeRobot dataset": (datasets(), run_dataset),
+    "drives of a job": (drive_jobs(), run_drive_job),
+    "loop of a job": (loop_jobs(), partial(run_drive_job, samples=80)),
 }

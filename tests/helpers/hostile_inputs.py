@@ -12,6 +12,7 @@ import tomllib
 import warnings
 import zipfile
 from functools import cache, partial
+from itertools import pairwise
 from pathlib import Path
 
 import h5py
@@ -45,7 +46,7 @@ def obey(*words, out=None):
 
     ``out`` is the file, or the folder, that it writes to.
     """
-    before = None if out is None else files_in(out)
+    before = files_in(out)
     shown, error = io.StringIO(), io.StringIO()
     with (
         contextlib.redirect_stdout(shown),
@@ -60,17 +61,16 @@ def obey(*words, out=None):
     assert code in (0, 1, 2), f"exit code {code}"
     assert "Traceback" not in error.getvalue()
     assert len(error.getvalue()) < 20_000, "an error of pages"
-    if out is not None and code != 0:
+    if code != 0:
         assert files_in(out) == before, f"half-written: {files_in(out)}"
-    if out is not None:
-        hidden = [name for name in files_in(Path(out).parent) if "/." in name]
-        assert not hidden, f"left behind: {hidden}"
+    hidden = [name for name in files_in(out and Path(out).parent) if "/." in name]
+    assert not hidden, f"left behind: {hidden}"
     return code
 
 
 def files_in(place):
-    place = Path(place)
-    found = place.rglob("*") if place.is_dir() else [place] if place.exists() else []
+    place = Path(place or "nowhere")
+    found = place.rglob("*") if place.is_dir() else [place]
     return sorted(str(path) for path in found if path.is_file())
 
 
@@ -117,24 +117,19 @@ def good_file(name):
     log = good_log()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
-        table = {"time": log.t, "q": log.q, "tau": log.tau, "joints": np.array(JOINTS)}
-        match name:
-            case "log.mcap":
-                write_mcap(path, messages_of(log))
-            case "log.bag":
-                write_bag1(path, messages_of(log))
-            case "log.db3":
-                write_bag2(path.with_suffix(""), {"/joint_states": messages_of(log)})
-                path = next(path.with_suffix("").glob("*.db3"))
-            case "plain.mat":
-                scipy.io.savemat(path, table)
-            case "plain.npz":
-                np.savez(path, **table)
-            case "plain.h5":
-                table["joints"] = [joint.encode() for joint in JOINTS]
-                write_hdf5(table, path)
-            case _:
-                write_log(log, path)
+        joints = [joint.encode() for joint in JOINTS]
+        table = {"time": log.t, "q": log.q, "tau": log.tau, "joints": joints}
+        if name == "log.mcap":
+            write_mcap(path, messages_of(log))
+        elif name == "log.bag":
+            write_bag1(path, messages_of(log))
+        elif name == "log.db3":
+            write_bag2(path.with_suffix(""), {"/joint_states": messages_of(log)})
+            path = next(path.with_suffix("").glob("*.db3"))
+        elif name.startswith("plain"):
+            READERS[path.suffix](table, path)
+        else:
+            write_log(log, path)
         return path.read_bytes()
 
 
@@ -166,10 +161,6 @@ def spoilt(draw, name):
             case "repeat":
                 content[at:at] = content[at : at + length]
     return bytes(content)
-
-
-def write_bytes(content, path):
-    path.write_bytes(content)
 
 
 # --- tables of hostile values --------------------------------------------------------------------
@@ -229,23 +220,19 @@ def write_csv(table, path):
     path.write_text("\n".join([",".join(table), *rows]), encoding="utf-8")
 
 
-def write_npz(table, path):
-    np.savez(path, **table)
-
-
-def write_mat(table, path):
-    scipy.io.savemat(path, table)
-
-
 def write_hdf5(table, path):
     with h5py.File(path, "w") as file:
         for name, values in table.items():
             file.create_dataset(name, data=values)
 
 
-def write_parquet(table, path):
-    pyarrow.parquet.write_table(pyarrow.table(table), path)
-
+READERS = {
+    ".csv": write_csv,
+    ".npz": lambda table, path: np.savez(path, **table),
+    ".mat": lambda table, path: scipy.io.savemat(path, table),
+    ".h5": write_hdf5,
+    ".parquet": lambda table, path: pyarrow.parquet.write_table(pyarrow.table(table), path),
+}
 
 # --- containers that claim what they do not hold -------------------------------------------------
 
@@ -269,9 +256,8 @@ def headers(draw):
     """Members of a zip whose NumPy headers claim anything."""
     made = {}
     for name in draw(st.lists(keys, min_size=1, max_size=4, unique=True)):
-        shape = tuple(draw(shapes))
         kind = draw(any_of("<f8 |O <U9 >i2 <M8[s] nonsense <f16 |V0"))
-        lacking = {"descr": kind, "shape": shape}
+        lacking = {"descr": kind, "shape": tuple(draw(shapes))}
         whole = lacking | {"fortran_order": draw(st.booleans())}
         texts = [repr(whole), repr(lacking), "{" * 200, "__import__('os')", ""]
         text = draw(st.sampled_from(texts))
@@ -309,16 +295,9 @@ links = st.dictionaries(link_names, st.sampled_from(targets), max_size=3)
 odd_hdf5 = st.tuples(arrays, st.dictionaries(keys, shapes, max_size=3), links)
 
 
-def cell_array(items):
-    """Return what SciPy writes as a cell array."""
-    made = np.empty(len(items), dtype=object)
-    for k, item in enumerate(items):
-        made[k] = item
-    return made
-
-
 def _nested(inner):
-    return st.lists(inner, max_size=3).map(cell_array) | st.dictionaries(keys, inner, max_size=3)
+    cell_arrays = st.lists(inner, max_size=3).map(lambda items: np.fromiter(items, dtype=object))
+    return cell_arrays | st.dictionaries(keys, inner, max_size=3)
 
 
 cells = st.recursive(odd, _nested)
@@ -358,36 +337,53 @@ def broken(draw, text, others):
     return text[:at] + draw(st.sampled_from(others)) + text[at:]
 
 
-def _paths(table, prefix=()):
-    """Yield the path of every key of a schema."""
-    for key, kind in table.items():
-        yield (*prefix, key)
-        inner = kind[0] if isinstance(kind, list) else kind
-        if isinstance(inner, dict):
-            yield from _paths(inner, (*prefix, key))
+rarely = st.integers(0, 9).map(lambda n: n == 0)
+#: What the settings of a kind may be, to their ends.
+MILD_OF = {
+    bool: st.booleans(),
+    str: any_of("usual none pd feedforward computed_torque perfect joint motor torque find urdf "
+                "one group link_1 link_2"),
+    float: st.sampled_from([0, 1e-9, 1e-3, 0.05, 0.5, 1, 1.0, 5.0, 30.0, 1e3, 1e5, 1e9, 1e12]),
+    list: st.sampled_from([[0.0, 0.0, 0.1], [1.0, 0.0, 1.0, 0.0, 0.0, 1.0], [1e9] * 6, [JOINTS]]),
+}  # fmt: skip
+named = st.sampled_from([*JOINTS, *JOINTS, "x", "joint_1.viscous", "link_1.mass"])
+MILD_OF[dict] = st.dictionaries(named, MILD_OF[float] | plain, max_size=3)
 
 
-PATHS = sorted(_paths(Job.schema()))
+def keys_of(schema, prefix=()):
+    """Yield the path and the kinds of every key of a schema, those of tables, too."""
+    for key, kind in schema.items():
+        path = (*prefix, key, 0) if isinstance(kind, list) else (*prefix, key)
+        table = kind[0] if isinstance(kind, list) else kind
+        if isinstance(table, dict):
+            yield from keys_of(table, path)
+        kinds = (dict,) if isinstance(table, dict) else kind
+        yield path, (kinds.outer,) if hasattr(kinds, "outer") else kinds
+
+
+@st.composite
+def settings_of(draw, schema, start="", odd=1):
+    """A table of a schema, begun as TOML, with more values, ``odd`` of ten of the wrong kind."""
+    table = tomllib.loads(start)
+    for path, kinds in draw(st.lists(st.sampled_from(list(keys_of(schema))), max_size=3)):
+        mild = st.one_of(*(MILD_OF[float if one is int else one] for one in kinds))
+        inside, value = table, draw(values if draw(st.integers(0, 9)) < odd else mild)
+        with contextlib.suppress(
+            TypeError, IndexError, AttributeError
+        ):  # an earlier value took that place
+            for key, following in pairwise(path):
+                default = [{}] if following == 0 else {}
+                inside = inside[key] if key == 0 else inside.setdefault(key, default)
+            inside[path[-1]] = value
+    return table
 
 
 @st.composite
 def jobs(draw):
     """The text of a job file with some values of any type and size."""
-    table = tomllib.loads(JOB)
+    table = draw(settings_of(Job.schema(), JOB, odd=7))
     if draw(st.booleans()):
         table["estimator"] = {"name": draw(st.sampled_from(sorted(ESTIMATORS)))}
-    for _ in range(draw(st.integers(1, 3))):
-        *above, last = draw(st.sampled_from(PATHS))
-        inside = table
-        for key in above:
-            inside = inside.setdefault(key, {}) if isinstance(inside, dict) else inside[0]
-            if not isinstance(inside, dict | list) or inside == []:
-                break
-        else:
-            if isinstance(inside, list):
-                inside = inside[0]
-            if isinstance(inside, dict):
-                inside[last] = draw(values)
     return broken(draw, toml_file(table), ["[" * 3000, "=", '"', "\0", "1" * 5000])
 
 
@@ -409,11 +405,15 @@ def toml(value):
     return repr(value)
 
 
-def run_job_file(text, folder):
-    write_log(good_log(200), folder / "fit.csv")
+def run_job(text, log, folder):
+    write_log(log, folder / "fit.csv")
     path, out = folder / "job.toml", folder / "out"
-    path.write_text(text, encoding="utf-8")
+    path.write_text(text, encoding="utf-8", errors="replace")
     obey("identify", path, "--out", out, out=out)
+
+
+def run_job_file(text, folder):
+    run_job(text, good_log(200), folder)
 
 
 flags = any_of(
@@ -496,14 +496,18 @@ def edited(content, given):
     return content
 
 
+def edits(places, new=replacements, least=0, most=2):
+    """Return a strategy of what is done with values at some of the places of a JSON value."""
+    actions = st.sampled_from(["put", "put", "drop", "add"])
+    place = st.sampled_from(places) if isinstance(places, list) else places
+    return st.lists(st.tuples(place, actions, new), min_size=least, max_size=most)
+
+
 @st.composite
 def results(draw):
     """The text of a result.json with values of any shape."""
-    actions, places = st.sampled_from(["put", "put", "drop", "add"]), result_places()
-    given = [
-        (draw(st.sampled_from(draw(st.sampled_from(places)))), draw(actions), draw(replacements))
-        for _ in range(draw(st.integers(1, 3)))
-    ]
+    deep = st.one_of(*(st.sampled_from(some) for some in result_places()))
+    given = draw(edits(deep, least=1, most=3))
     text = json.dumps(edited(json.loads(good_result()[1]), given))
     return broken(draw, text, ["[" * 5000, "", "\0", "9" * 5000, "é"])
 
@@ -525,32 +529,32 @@ def run_result(text, folder):
 
 # --- all of them ---------------------------------------------------------------------------------
 
-READERS = {".csv": write_csv, ".npz": write_npz, ".mat": write_mat, ".h5": write_hdf5,
-           ".parquet": write_parquet}  # fmt: skip
 FILES = [*(f"log{x}" for x in (*READERS, ".mcap", ".bag", ".db3")),
          "plain.npz", "plain.mat", "plain.h5"]  # fmt: skip
 
 
-def logs_of(write, suffix):
-    return (), partial(read_log_file, write, suffix)
+def read_as(suffix, write=None):
+    return partial(read_log_file, write or READERS[suffix], suffix)
 
 
 #: By name: a strategy of examples, and what is done with one in an empty folder.
 KINDS = {
     **{
-        f"bytes of {name}": (spoilt, (name,), logs_of(write_bytes, Path(name).suffix)[1])
+        f"bytes of {name}": (
+            spoilt(name), read_as(Path(name).suffix, lambda new, path: path.write_bytes(new))
+        )
         for name in FILES
     },
-    **{f"values in {suffix}": (columns, *logs_of(x, suffix)) for suffix, x in READERS.items()},
-    "headers in .npz": (headers, *logs_of(write_members, ".npz")),
-    "arrays in .npz": (lambda: arrays, *logs_of(write_npz, ".npz")),
-    "structure of .h5": (lambda: odd_hdf5, *logs_of(write_odd_hdf5, ".h5")),
+    **{f"values in {suffix}": (columns(), read_as(suffix)) for suffix in READERS},
+    "headers in .npz": (headers(), read_as(".npz", write_members)),
+    "arrays in .npz": (arrays, read_as(".npz")),
+    "structure of .h5": (odd_hdf5, read_as(".h5", write_odd_hdf5)),
     "structure of .mat": (
-        lambda: st.dictionaries(keys, cells, max_size=4), *logs_of(write_odd_mat, ".mat")
+        st.dictionaries(keys, cells, max_size=4), read_as(".mat", write_odd_mat)
     ),
-    "values, identified": (columns, (300, st.sampled_from(MILD)), identify_from),
-    "job file": (jobs, (), run_job_file),
-    "flags": (lambda: command_lines, (), run_flags),
-    "result.json": (results, (), run_result),
-    "URDF": (urdf_inputs, (), run_urdf),
+    "values, identified": (columns(300, st.sampled_from(MILD)), identify_from),
+    "job file": (jobs(), run_job_file),
+    "flags": (command_lines, run_flags),
+    "result.json": (results(), run_result),
+    "URDF": (urdf_inputs(), run_urdf),
 }  # fmt: skip

@@ -3,18 +3,17 @@
 import base64
 import json
 import math
-import re
-from dataclasses import dataclass, field
-from html.parser import HTMLParser
+from dataclasses import dataclass
 
+import lxml.html
 import numpy as np
 
 
 @dataclass
 class Table:
-    headers: list[str] = field(default_factory=list)
-    rows: list[list[str]] = field(default_factory=list)
-    foot: list[str] = field(default_factory=list)
+    headers: list[str]
+    rows: list[list[str]]
+    foot: list[str]
 
     def column(self, head):
         return [row[self.headers.index(head)] for row in self.rows]
@@ -24,48 +23,17 @@ class Table:
         return {row[0]: dict(zip(self.headers, row, strict=True)) for row in self.rows}
 
 
-class _Tables(HTMLParser):
-    def __init__(self):
-        super().__init__()
-        self.found, self.words, self.part = [], None, ""
-
-    def handle_starttag(self, tag, attrs):
-        if tag == "table":
-            self.found.append(["", Table()])
-        elif tag in ("thead", "tbody", "tfoot"):
-            self.part = tag
-        elif tag == "tr":
-            self.cells = []
-        elif tag in ("caption", "th", "td"):
-            self.words = []
-
-    def handle_data(self, data):
-        if self.words is not None:
-            self.words.append(data)
-
-    def handle_endtag(self, tag):
-        if tag in ("caption", "th", "td"):
-            said, self.words = "".join(self.words), None
-            if tag == "caption":
-                self.found[-1][0] = said
-            else:
-                self.cells.append(said)
-        elif tag == "tr":
-            table = self.found[-1][1]
-            if self.part == "thead":
-                table.headers = self.cells
-            elif self.part == "tbody":
-                table.rows.append(self.cells)
-            else:
-                table.foot = self.cells
-
-
 def tables(html):
     """Return the tables of a page by their captions."""
-    reader = _Tables()
-    reader.feed(html)
-    found = dict(reader.found)
-    assert len(found) == len(reader.found), "two tables have one caption"
+    found = {}
+    for table in lxml.html.fromstring(html).iter("table"):
+        caption = str(table.xpath("string(caption)"))
+        assert caption not in found, "two tables have one caption"
+        head, body, foot = (
+            [[cell.text_content() for cell in row.iter("th", "td")] for row in table.iterfind(path)]
+            for path in ("thead/tr", "tbody/tr", "tfoot/tr")
+        )
+        found[caption] = Table(head[-1] if head else [], body, foot[-1] if foot else [])
     return found
 
 
@@ -86,15 +54,14 @@ def percent(value):
 def charts(html):
     """Return the data of a page's charts, decoded: what charts.js draws."""
     found = []
-    for text in re.findall(
-        r'<figure class="chart">.*?<script type="application/json">(.*?)</script>', html, re.DOTALL
-    ):
-        what = json.loads(text)
-        what["x"] = unpacked(what["x"])
-        for series in what["series"]:
-            series["y"] = unpacked(series["y"])
-            series["half"] = None if series["half"] is None else unpacked(series["half"])
-        found.append(what)
+    scripts = "//figure[@class='chart']//script[@type='application/json']"
+    for script in lxml.html.fromstring(html).xpath(scripts):
+        chart = json.loads(script.text)
+        chart["x"] = numbers_of(chart["x"])
+        for series in chart["series"]:
+            series["y"] = numbers_of(series["y"])
+            series["half"] = None if series["half"] is None else numbers_of(series["half"])
+        found.append(chart)
     return found
 
 
@@ -104,21 +71,22 @@ def chart(html, title):
     return found
 
 
-def unpacked(packed):
-    """Return the numbers of an array in a page, the last code as NaN."""
-    codes = np.frombuffer(base64.b64decode(packed["data"]), f"<u{packed['bits'] // 8}")
-    last = 2 ** packed["bits"] - 1
-    values = packed["low"] + codes / (last - 1) * (packed["high"] - packed["low"])
-    values = np.where(codes == last, np.nan, values)
-    return 10.0**values if packed["log"] else values
+def numbers_of(packed):
+    """Return the numbers of an array in a page; of steps, the last code is NaN."""
+    codes = np.frombuffer(base64.b64decode(packed["data"]), packed["kind"])
+    codes = codes.reshape(packed["shape"])
+    if "step" not in packed:
+        return codes
+    values = np.array(packed["low"]) + np.array(packed["step"]) * codes
+    values = np.where(codes == np.iinfo(codes.dtype).max, np.nan, values)
+    return 10.0**values if packed.get("log") else values
 
 
 def bars(html):
     """Return by joint, in order, where its bar ends and where each mark stands [%]."""
     found = {}
-    for row in re.findall(r"<li class=\"[\w-]*\">(<a .*?)</li>", html, flags=re.DOTALL):
-        name = re.sub(r"<[^>]*>", "", row[: row.index("</a>")])
-        width = re.search(r'<rect y="4" width="([\d.]*)%"', row)
-        marks = [float(x) for x in re.findall(r'<svg x="([\d.]*)%"', row)]
-        found[name] = (float(width[1]), marks)
+    for row in lxml.html.fromstring(html).xpath("//li[a and .//rect[@y='4']]"):
+        [width] = row.xpath(".//rect[@y='4']/@width")
+        marks = [float(x.rstrip("%")) for x in row.xpath(".//svg/@x") if x.endswith("%")]
+        found[row.find("a").text_content()] = (float(width.rstrip("%")), marks)
     return found

@@ -11,13 +11,13 @@ import math
 import os
 import re
 from contextlib import redirect_stderr, redirect_stdout
-from html.parser import HTMLParser
 from pathlib import Path
 from unittest import mock
 
+import lxml.html
 import numpy as np
 
-from helpers.pages import unpacked as numbers_of
+from helpers.pages import numbers_of
 from robotid.cli import main
 
 HERE = Path(__file__).resolve().parents[1] / "figures"
@@ -206,104 +206,63 @@ def table_content(path):
     }
 
 
-class _Page(HTMLParser):
-    """Texts, links and charts of a page."""
-
-    _BLOCKS = frozenset((
-        "p", "li", "tr", "h1", "h2", "h3", "h4", "figcaption", "summary", "pre", "dd", "dt",
-        "figure", "div", "section", "header", "caption", "table", "svg", "ol", "ul", "dl",
-    ))  # fmt: skip
-
-    def __init__(self):
-        super().__init__()
-        self.texts, self.charts, self.drawn = [], [], []
-        self._line, self._script, self._skips, self._depth = [], None, False, 0
-        self._is_title = False  # of a drawing; its other texts are those of its chart's data
-
-    def handle_starttag(self, tag, attrs):
-        attrs = dict(attrs)
-        if tag in ("script", "style"):
-            self._skips = True
-            is_data = attrs.get("type") == "application/json" or "id" in attrs
-            self._script = [] if tag == "script" and is_data else None
-            return
-        self._is_title = tag == "title"
-        if tag == "svg":
-            self._depth += 1
-            if self._depth == 1:
-                self.drawn.append([])
-        if self._depth:
-            for key, value in attrs.items():
-                if key not in ("id", "href", "viewbox", "aria-labelledby", "class", "role"):
-                    self.drawn[-1] += [float(x) for x in _COORDINATE.findall(value or "")]
-        if tag in self._BLOCKS:
-            self._end_line()
-        elif tag != "wbr":  # which breaks words
-            self._line.append(" ")
-        for key in ("aria-label", "title", "href", "style"):
-            if attrs.get(key) and not (key == "href" and attrs[key].startswith("#")):
-                self._line.append(f"[{attrs[key]}] ")
-        if tag in ("td", "th"):
-            self._line.append("| ")
-        if tag in ("tr", "div", "td") and attrs.get("class"):
-            self._line.append(f"({attrs['class']}) ")
-
-    def handle_endtag(self, tag):
-        self._is_title = False
-        if tag in ("script", "style"):
-            if self._script:
-                self.charts.append("".join(self._script))
-            self._skips, self._script = False, None
-        if tag == "svg":
-            self._depth -= 1
-        if tag in self._BLOCKS:
-            self._end_line()
-        else:
-            self._line.append(" ")
-
-    def handle_data(self, data):
-        if self._script is not None:
-            self._script.append(data)
-        elif not self._skips and (not self._depth or self._is_title):
-            self._line.append(data)
-
-    def _end_line(self):
-        line = " ".join("".join(self._line).split())
-        if line:
-            self.texts.append(line)
-        self._line = []
-
-
+_BLOCKS = frozenset((
+    "p", "li", "tr", "h1", "h2", "h3", "h4", "figcaption", "summary", "pre", "dd", "dt",
+    "figure", "div", "section", "header", "caption", "table", "svg", "ol", "ul", "dl",
+))  # fmt: skip
+_BREAK = "\u2029"  # between lines of a page
 _COORDINATE = re.compile(r"-?\d+\.?\d*")
 
 
 def page_content(html):
-    """Return what a page shows: texts, charts' data, and a few figures of each drawing."""
-    page = _Page()
-    page.feed(html)
-    page.close()
-    page._end_line()
-    charts = []
-    for text in page.charts:
-        try:
-            charts.append(unpacked(json.loads(text)))
-        except ValueError:
-            continue
+    """Return what a page shows: texts and links, charts' data, a few figures of each drawing."""
+    page = lxml.html.fromstring(html)
+    lxml.html.etree.strip_tags(page, "wbr")  # which breaks words
+    data = page.xpath("//script[@type='application/json' or (@id and not(@type))]/text()")
+    drawn = [_coordinates(svg) for svg in page.xpath("//svg[not(ancestor::svg)]")]
+    for element in page.xpath("//script | //style | //svg//text()[not(parent::title)]/.."):
+        element.text = ""  # words of a drawing are those of its chart's data
+    for element in page.iter(lxml.html.etree.Element):
+        href = element.get("href", "")
+        told = [element.get(key) for key in ("aria-label", "title", "style")]
+        told.insert(2, "" if href.startswith("#") else href)
+        words = [f"[{word}]" for word in told if word]
+        words += ["|"] * (element.tag in ("td", "th"))
+        if element.tag in ("tr", "div", "td") and element.get("class"):
+            words.append(f"({element.get('class')})")
+        edge = _BREAK if element.tag in _BLOCKS else " "
+        element.text = f"{edge}{' '.join(words)} {element.text or ''}"
+        element.tail = f"{edge}{element.tail or ''}"
+    lines = (" ".join(line.split()) for line in page.text_content().split(_BREAK))
     # how long a design took is drawn, too
-    drawn = [] if "computing time [s]" in html else page.drawn
-    drawn = [summary(x, _OF_CHART) for x in drawn if len(x) > _LONG]
-    return {"texts": page.texts, "charts": charts, "drawings": drawn}
+    shown = [] if "computing time [s]" in html else [x for x in drawn if len(x) > _LONG]
+    return {
+        "texts": [line for line in lines if line],
+        "charts": [unpacked(json.loads(text)) for text in data],
+        "drawings": [summary(x, _OF_CHART) for x in shown],
+    }
+
+
+def _coordinates(svg):
+    """Return the numbers of a drawing's attributes."""
+    texts = [
+        value for element in svg.iter(lxml.html.etree.Element)
+        for key, value in element.attrib.items()
+        if key not in ("id", "href", "viewbox", "aria-labelledby", "class", "role")
+    ]  # fmt: skip
+    return [float(x) for text in texts for x in _COORDINATE.findall(text)]
 
 
 def unpacked(value):
     """Return the data of a chart with its packed numbers told by a few figures."""
     if isinstance(value, dict):
-        if {"data", "low", "high"} <= value.keys():
-            return summary(numbers_of(value), _OF_CHART) | (
-                {"is_log": True} if value["log"] else {}
-            )
         if {"data", "kind", "shape"} <= value.keys():
-            return told_columns(value)
+            if "step" not in value:
+                return told_columns(value)
+            if len(value["shape"]) > 1:
+                return {"low": value["low"], "step": value["step"], "codes": told_columns(value)}
+            is_log = {"is_log": True} if "log" in value else {}
+            return summary(numbers_of(value), _OF_CHART) | is_log
         usual = {"faint": False, "hidden": False, "half": None, "marks": [], "logarithmic": "",
                  "x_names": [], "spans": []}  # fmt: skip
         if value.get("x_label") == "computing time [s]":

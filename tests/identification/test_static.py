@@ -7,9 +7,9 @@ import pinocchio as pin
 import pytest
 from helpers.synthetic import truth
 
+from robotid.cli.identify import identify
 from robotid.data.log import Log
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.identification.pipeline import identify
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

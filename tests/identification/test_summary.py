@@ -3,7 +3,7 @@
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
-from robotid.identification.pipeline import identify
+from robotid.cli.identify import identify
 from robotid.identification.summary import error_lines, friction_lines, verdict_lines
 from robotid.robot.model import RobotModel
 

@@ -8,13 +8,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.pages import number, tables
+from helpers.pages import chart, charts, number, tables
 
 from robotid.paper import run as paper
-from robotid.paper import study
 from robotid.paper.procedure import LoopSettings
 from robotid.paper.run import run_paper
-from robotid.paper.study import CASES, MODELS, PaperSettings, energy_drift
+from robotid.paper.study import CASES, MODELS, PaperSettings, energy_drift, study_model
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import INERTIAL_TERMS
 
@@ -26,8 +25,8 @@ def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("paper") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper, "energy_drift", lambda: energy_drift(duration=1.0))
-        for module in (paper, study):
-            patch.setattr(module, "LoopSettings", partial(LoopSettings, updates=20))
+        for module in ("run", "study"):
+            patch.setattr(f"robotid.paper.{module}.LoopSettings", partial(LoopSettings, updates=20))
         return folder, run_paper(folder, settings=FEW)
 
 
@@ -87,9 +86,6 @@ def test_the_page_is_whole_and_offline(written):
         assert said in html
 
 
-# --- the page ---------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def folder(written):
     return written[0]
@@ -137,13 +133,25 @@ def test_the_inertial_vector_is_in_the_papers_order(shown, content, folder, html
     np.testing.assert_allclose(found[[4, 6, 14, 16]], true[[4, 6, 14, 16]] / 2)
 
 
+def test_the_page_is_good_only_if_every_model_has_converged(content):
+    for last, status in (((5e-5, 5e-5, 9e-5), "good"), ((5e-5, 2e-4, 5e-5), "poor")):
+        models = {
+            name: {**model, "relative_error": [0.5, error]}
+            for (name, model), error in zip(content["models"].items(), last, strict=True)
+        }
+        assert f'class="verdict {status}"' in paper._summary({**content, "models": models})
+
+
 def test_a_case_is_judged_at_its_end_by_a_tenth_and_by_the_mean_of_the_later_half(rng):
     P, count = np.array([3.0, -4.0]), len(CASES)
     errors = np.append(0.5 * 0.9 ** np.arange(20), 5e-5)
     estimates = P + rng.standard_normal((21, count, 2))
+    history = SimpleNamespace(estimates=estimates, prx=np.ones((20, count)))
     study = SimpleNamespace(
-        P=P, history=SimpleNamespace(estimates=estimates), errors=lambda case: errors
-    )
+        P=P, history=history, NA=None, dynamics=SimpleNamespace(names=("p1", "p2")),
+        errors=lambda case="clean": errors,
+    )  # fmt: skip
+    assert paper._model(study)["converged"] is True
     for k, case in enumerate(CASES):
         found = paper._case(study, case)
         mean = estimates[-10:, k].mean(axis=0)  # of 21, five tenths of two each
@@ -154,6 +162,72 @@ def test_a_case_is_judged_at_its_end_by_a_tenth_and_by_the_mean_of_the_later_hal
         assert found["conditions"] == CASES[case].title
     errors = 2.0 * errors + 1e-6
     said = {case: paper._case(study, case) for case in ("on_program", "noisy")}
-    assert not any(found["converged"] for found in said.values())
+    assert not any(found["converged"] for found in (*said.values(), paper._model(study)))
     assert said["on_program"]["reason"].startswith("slow: every run follows the same curve")
     assert said["noisy"]["reason"].startswith("A disturbance v is part of the deviation")
+
+
+@pytest.fixture(scope="module")
+def studies():
+    return [study_model(name, PaperSettings(iterations=3, longest=1)) for name in MODELS]
+
+
+def close(drawn, wanted):
+    """Assert that a series is the data, to what 16 bits tell apart."""
+    np.testing.assert_allclose(drawn, wanted, atol=2e-5 * max(np.ptp(wanted), 1e-9))
+
+
+def test_figure_4_is_the_control_of_its_joint_by_iterations(studies):
+    html = paper._control_figures(studies)
+    for study in studies:
+        for joint in (0, 1):
+            u = study.history.torques[:, :, joint]
+            title = f"Figure 4({'ab'[joint]}). {study.name}: control u{joint + 1} (21)"
+            upper, lower = [what for what in charts(html) if what["title"].startswith(title)]
+            close(upper["x"], 0.02 * np.arange(100))
+            assert [s["label"] for s in upper["series"][:2]] == ["iteration 1", "iteration 2"]
+            for k in (0, 1):
+                close(upper["series"][k]["y"], u[k])
+                close(lower["series"][k]["y"], u[k] - u[-1])
+            _, program = study.program_control(101)
+            close(upper["series"][-1]["y"], program[:-1, joint])
+
+
+def test_figure_3_is_the_program_motion_of_its_joint():
+    drawn = charts(paper._program_figures())
+    t = np.linspace(0.0, 1.0, 201)  # over the duration of 2 s
+    shape = 10 * t**3 - 15 * t**4 + 6 * t**5  # (28)
+    rate, curvature = (30 * t**2 * (1 - t) ** 2 / 2, 60 * t * (1 - t) * (1 - 2 * t) / 4)
+    parts = [amplitude * x for amplitude in (1.0, 1.5) for x in (shape, rate, curvature)]
+    for what, wanted in zip(drawn, parts, strict=True):
+        close(what["x"], 2.0 * t)
+        close(what["series"][0]["y"], wanted)
+
+
+def test_figure_5_is_each_parameter_beside_its_true_value(studies):
+    html = paper._estimate_figures(studies)
+    for study in studies:
+        series = chart(html, f"Figure 5. {study.name}")["series"]
+        count = len(study.dynamics.names)
+        for i, name in enumerate(study.dynamics.names):
+            assert [series[i]["label"], series[count + i]["label"]] == [name, f"{name}, true"]
+            close(series[i]["y"], study.history.estimates[:, 0, i])
+            close(series[count + i]["y"], np.full(4, study.P[i]))
+
+
+def test_errors_are_those_of_their_model_and_case(studies):
+    html = paper._convergence_figures(studies)
+    prx, errors = (chart(html, title)["series"] for title in ("Largest entry", "Parameter error"))
+    for k, study in enumerate(studies):
+        known = np.isfinite(prx[k]["y"])
+        assert not known[0]  # before the first iteration there is none
+        np.testing.assert_allclose(prx[k]["y"][known], study.history.prx[:, 0], rtol=1e-3)
+        np.testing.assert_allclose(errors[k]["y"], study.errors(), rtol=1e-3)
+        np.testing.assert_allclose(errors[3 + k]["y"], study.errors("on_program"), rtol=1e-3)
+    html = paper._disturbed_figures(studies)
+    for study in studies:
+        series = chart(html, study.name)["series"]
+        for line, case in zip(
+            series, ("clean", "disturbed", "noisy", "noisy_dead_zone"), strict=True
+        ):
+            np.testing.assert_allclose(line["y"], study.errors(case), rtol=1e-3)

@@ -33,13 +33,14 @@ def test_the_links_of_a_body_add_up_to_it(name, free_flyer):
 
 def test_the_inertia_of_a_link_is_moved_from_its_turned_frame(tmp_path):
     (tmp_path / "r.urdf").write_text("""<robot name="r"><link name="base"/><link name="arm">
-      <inertial><origin xyz="0.1 0 0" rpy="0 0 1.5707963267948966"/><mass value="2"/>
-      <inertia ixx="1" ixy="0" ixz="0" iyy="2" iyz="0" izz="2.5"/></inertial></link>
+      <inertial><origin xyz="0.1 -0.2 0.3" rpy="0.4 -0.7 1.2"/><mass value="2"/>
+      <inertia ixx="1" ixy="0.1" ixz="-0.2" iyy="2" iyz="0.3" izz="2.5"/></inertial></link>
       <joint name="j" type="continuous"><parent link="base"/><child link="arm"/></joint></robot>""")
     place = link_places(RobotModel.from_urdf(tmp_path / "r.urdf"))[1]
-    # turned by 90 degrees about z, then moved by 0.1 m along x: 2 * 0.01 about y and z
-    expected = [2, 0.2, 0, 0, 2, 0, 1.02, 0, 0, 2.52]
-    np.testing.assert_allclose(place.parameters, expected, atol=1e-12)
+    at = pin.SE3(pin.rpy.rpyToMatrix(0.4, -0.7, 1.2), np.array([0.1, -0.2, 0.3]))
+    moments = np.array([[1.0, 0.1, -0.2], [0.1, 2.0, 0.3], [-0.2, 0.3, 2.5]])
+    moved = at.act(pin.Inertia(2.0, np.zeros(3), moments))
+    np.testing.assert_allclose(place.parameters, moved.toDynamicParameters(), atol=1e-12)
 
 
 def test_links_behind_a_locked_joint_are_held(panda):

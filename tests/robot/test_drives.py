@@ -9,6 +9,7 @@ import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import DataError, NotConvergedError, SettingsError
+from robotid.cli.identify import identify
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
@@ -19,7 +20,6 @@ from robotid.dynamics.rows import COMPILED, TrajectoryRows
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulator import RobotPlant
 from robotid.dynamics.torque import InstantRegressor, joint_torque_regressor, trajectory_regressor
-from robotid.identification.pipeline import identify
 from robotid.output.files.urdf import load_identified, read_sidecar, write_urdf
 from robotid.robot.drive_term import DriveMotion
 from robotid.robot.drives import (

@@ -4,24 +4,20 @@ import pytest
 import trimesh
 from helpers.hostile_urdfs import FILES
 
-from robotid.base.exceptions import SettingsError
 from robotid.diagnosis.urdf.inspection import inspect_urdf
-from robotid.output.viewer.scene import robot_scene
+from robotid.output.viewer.replays import robot_scene
 from robotid.robot.examples import example_urdfs
 from robotid.robot.geometry import (
     body_boxes,
     body_points,
-    box_half_spaces,
     find_mesh,
-    geometry_half_spaces,
-    hull_half_spaces,
     kinematic_lengths,
     read_shapes,
     read_surfaces,
 )
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
-from robotid.robot.urdf_text import parse_urdf
+from robotid.robot.tree import parse_urdf
 
 URDF = """<robot name="arm">
 <link name="base"/>
@@ -85,9 +81,6 @@ def test_the_extent_of_a_shape_is_that_which_the_urdf_states(tmp_path, shape, lo
 
 def test_a_body_whose_link_has_mass_but_no_shape_is_not_bounded(tmp_path):
     assert body_points(arm(tmp_path, BOX)) == {}
-    with pytest.raises(SettingsError, match=r"no link has readable geometry in arm\.urdf"):
-        geometry_half_spaces(arm(tmp_path, BOX), "hull")
-    assert geometry_half_spaces(arm(tmp_path, BOX), "none") == {}
 
 
 def test_a_mesh_is_found_beside_the_urdf_and_scaled(tmp_path):
@@ -99,22 +92,6 @@ def test_a_mesh_is_found_beside_the_urdf_and_scaled(tmp_path):
         np.testing.assert_allclose(low, [-0.25, -1.0, -1.5], atol=1e-6)
     assert body_points(arm(tmp_path, MESH.format("lost.stl"), SPHERE)) == {}
     assert body_points(arm(tmp_path, BOX + MESH.format("lost.stl"), SPHERE)) == {}
-
-
-def test_half_spaces_hold_every_point_and_touch_the_hull(rng):
-    cube = np.array(np.meshgrid(*[[0.0, 1.0]] * 3)).reshape(3, -1).T
-    cloud = rng.standard_normal((3000, 3))
-    cloud /= np.linalg.norm(cloud, axis=1)[:, None]  # its hull has thousands of faces
-    for points in (cube, cloud):
-        for A, b in (box_half_spaces(points), hull_half_spaces(points)):
-            slack = b[:, None] - A @ points.T
-            assert slack.min() > -1e-9
-            np.testing.assert_allclose(slack.min(axis=1), 0.0, atol=1e-9)
-            assert len(b) <= 100
-    A, b = hull_half_spaces(cube)
-    assert len(b) == 6
-    A, b = hull_half_spaces(cube * [1.0, 1.0, 0.0])
-    assert len(b) == 6
 
 
 def test_the_box_of_a_body_holds_its_geometry_or_its_frames_and_the_urdfs_own_body(tmp_path):
@@ -190,8 +167,7 @@ def test_geometry_that_cannot_be_read_bounds_nothing_and_is_named(tmp_path, shap
     (tmp_path / "folder.stl").mkdir()
     model = arm(tmp_path, one=shape, flange=BOX)
     assert body_points(model) == {}
-    with pytest.raises(SettingsError, match="com_within is 'hull', but no link has readable"):
-        geometry_half_spaces(model, "hull")
+
     codes = {finding.code for finding in inspect_urdf(model.tree.path).findings}
     assert ("geometry_unread" in codes) == ("mesh" in shape)
 

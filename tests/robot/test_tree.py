@@ -9,8 +9,7 @@ import pytest
 
 from robotid.base.exceptions import ModelError
 from robotid.robot.model import RobotModel
-from robotid.robot.tree import read_tree
-from robotid.robot.urdf_text import exact_angle, numbers, parse_urdf
+from robotid.robot.tree import exact_angle, numbers, parse_urdf, read_tree
 
 LINK = """<link name="{0}"><inertial><origin xyz="0.1 0 0"/><mass value="{1}"/>
   <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>"""

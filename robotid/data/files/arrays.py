@@ -1,7 +1,4 @@
-"""NPZ, HDF5 and MATLAB files, which contain arrays at paths, as tables of named columns.
-
-Arrays of MuJoCo and Isaac Lab (generalised coordinates, states of the root) are standard columns.
-"""
+"""NPZ, HDF5 and MATLAB files as tables of columns, those of MuJoCo and Isaac Lab among them."""
 
 import math
 import zipfile
@@ -134,11 +131,7 @@ MAT = Format((".mat",), _open_mat, _write_mat, written=(".mat",), topics="group"
 
 
 def _table_of_arrays(path: Path, entries: Mapping[str, _Entry], source: LogSource) -> Table:
-    """Return the table in a file of arrays.
-
-    A vector is a column of its own name. A matrix of N samples, along its longer side, is n
-    columns ``q_<joint>`` in the order of an entry ``joints``, else ``q_0``, ``q_1``, ...
-    """
+    """Return the table in a file of arrays: of a matrix the columns ``q_<joint>``, else ``q_0``."""
     where = path.name
     group = _group(where, list(entries), source.topic)
     inside = {at[len(group) :]: x for at, x in entries.items() if at.startswith(group)}
@@ -234,9 +227,8 @@ def _joint_columns(
 def _base_columns(where: str, arrays: Mapping[str, _Entry], joints: int) -> dict[str, _Column]:
     """Return the columns of a floating base in arrays of a simulator.
 
-    MuJoCo's free joint has its linear velocity v with the world's axes, its angular velocity w with
-    the base's: the rate of v with the base's axes is R^T dv/dt - w x v. Isaac Lab's state of the
-    root has both with the world's axes; that of the centre of mass is not used.
+    MuJoCo's v has the world's axes, w the base's: the rate of v with the base's axes is R^T dv/dt -
+    w x v. Isaac Lab's state of the root has both with the world's axes.
     """
     root = next((name for name in _ROOTS if name in arrays), "")
     if joints and "qpos" in arrays and arrays["qpos"].width == joints + 7:

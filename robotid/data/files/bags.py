@@ -1,8 +1,4 @@
-"""Bags of ROS 1 and ROS 2, including MCAP: joints, commands and sensors as a table of columns.
-
-A row is a message of the joints; columns of sensors are interpolated. The library rosbags reads all
-bags; ROS need not be installed.
-"""
+"""Bags of ROS 1 and 2, MCAP included: a row is a message of joints; sensors are interpolated."""
 
 import re
 from array import array
@@ -92,9 +88,7 @@ def _open(path: Path, source: LogSource) -> Table:
     """Return the table of a .mcap, .db3 or .bag file, or of the folder of a ROS 2 bag.
 
     Columns are ``time`` [s] since the epoch, ``position_<joint>``, ``velocity_<joint>`` and
-    ``effort_<joint>``; of Unitree's LowState by the number of the motor. Messages without any
-    required column are ignored; one with only some of them is a ``DataError``. Commands are those
-    of a controller's state (``_controlled``), or of a second topic, by a zero-order hold.
+    ``effort_<joint>``; of Unitree's LowState by the number of the motor.
     """
     with _opened(path, source) as bag:
         sensors = _sensors_of(bag)
@@ -277,11 +271,7 @@ def _content(
 
 
 def _controlled(message: Any) -> dict[str, Any]:  # noqa: ANN401
-    """Return the fields of a controller's state; a field with NaN only is empty.
-
-    Commands are its output to the drives, else its reference; the effort is that of the reference.
-    Up to control_msgs 4 its points were called desired and actual.
-    """
+    """Return the fields of a controller's state, also up to control_msgs 4; NaN only is empty."""
 
     def first(name: str, *points: str) -> Any:  # noqa: ANN401
         candidates = (getattr(getattr(message, point, None), name, ()) for point in points)
@@ -312,11 +302,23 @@ def _table(where: str, blocks: dict[Layout, _Block]) -> Table:
 
 
 def _read(where: str, blocks: dict[Layout, _Block], wanted: Sequence[str]) -> dict[str, Array]:
-    """Return columns, in the order of the messages."""
+    """Return columns, in the order of the messages; reject messages with only some of them."""
     columns = [name for name in wanted if name != "time"]
     used = [layout for layout in blocks if not set(columns).isdisjoint(_columns(layout))]
-    _require_whole(where, {layout: blocks[layout] for layout in used}, columns)
+    lacking = {
+        blocks[layout].number[0]: (missing, len(blocks[layout].number))
+        for layout in used
+        if (missing := [name for name in columns if name not in _columns(layout)])
+    }
     number = np.concatenate([blocks[layout].number for layout in used])
+    if lacking:
+        first = min(lacking)
+        raise DataError(
+            f"{where}: {sum(n for _, n in lacking.values())} of {len(number)} messages lack some "
+            f"of the required values, the first (message {first}) lacks "
+            f"{listed(lacking[first][0])}. A row is one message; read only joints that are always "
+            "published together, and leave out the others"
+        )
     order = np.argsort(number)
     parts: dict[str, list[Array]] = {name: [] for name in wanted}
     for layout in used:
@@ -327,23 +329,6 @@ def _read(where: str, blocks: dict[Layout, _Block], wanted: Sequence[str]) -> di
         if "time" in parts:
             parts["time"].append(np.frombuffer(block.stamp, dtype=np.int64) / 1e9)
     return {name: np.concatenate(part)[order] for name, part in parts.items()}
-
-
-def _require_whole(where: str, blocks: dict[Layout, _Block], columns: Sequence[str]) -> None:
-    """Reject messages that have only some of the columns."""
-    lacking = {
-        block.number[0]: (missing, len(block.number))
-        for layout, block in blocks.items()
-        if (missing := [name for name in columns if name not in _columns(layout)])
-    }
-    if lacking:
-        first, total = min(lacking), sum(len(block.number) for block in blocks.values())
-        raise DataError(
-            f"{where}: {sum(n for _, n in lacking.values())} of {total} messages lack some of the "
-            f"required values, the first (message {first}) lacks {listed(lacking[first][0])}. A "
-            "row is one message; read only joints that are always published together, and leave "
-            "out the others"
-        )
 
 
 def _stamps(blocks: dict[Layout, _Block]) -> Array:

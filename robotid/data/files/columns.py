@@ -88,10 +88,7 @@ def _numbered(
     joints: Collection[str],
     orders: Sequence[Sequence[str]],
 ) -> Reading | None:
-    """Return columns whose joints have consecutive numbers, in the order of the joints.
-
-    None if each has the name of a joint, or if the numbers are not as many as the joints.
-    """
+    """Return columns of joints with as many consecutive numbers and no names, in their order."""
     labels: dict[str, list[str]] = {}  # names of joints in the file, by quantity
     for _, (kind, label) in read:
         labels.setdefault(kind, []).append(label)
@@ -562,10 +559,7 @@ class Finder:
     def _missing(
         self, names: Sequence[str], absent: Sequence[tuple[str, str]], recognised: Mapping[str, str]
     ) -> DataError:
-        """Return the error of missing columns: what was found, and a table to complete.
-
-        ``absent`` has quantity and joint, or motor; ``recognised`` the columns by standard name.
-        """
+        """Return the error of absent quantities and joints: what was found, a table to complete."""
         sought = [f"{kind}_{self._named(place)}" for kind, place in absent]
         sizes = [name for name in names if name.startswith(_SIZES)]
         left = [x for x in names if x not in {*recognised.values(), *sizes}]

@@ -1,8 +1,4 @@
-"""Parquet files as tables of columns, tables of texts and numbers that are no logs, and LeRobot.
-
-A LeRobot dataset is a folder of version 2 or 3: an episode is a table, with positions in
-``observation.state`` and commanded positions in ``action``. pyarrow is imported at the first use.
-"""
+"""Parquet files, tables that are no logs, and episodes of LeRobot datasets of version 2 or 3."""
 
 import csv
 import re

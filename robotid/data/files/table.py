@@ -1,8 +1,4 @@
-"""The common form of all file formats: named columns, read as a whole or row by row.
-
-Columns with names of other programs (PlotJuggler, rostopic, DataFrames), stamps in two columns and
-stamps with equal steps are columns that are computed from others.
-"""
+"""The common form of all file formats: named columns, read as a whole or row by row."""
 
 import re
 from abc import ABC, abstractmethod
@@ -201,11 +197,7 @@ def _numbers(values: Any, name: str) -> Array:  # noqa: ANN401
 
 
 def with_standard_names(table: Table, where: str, kind: str, source: LogSource) -> Table:
-    """Return a table with the columns of PlotJuggler renamed to standard names.
-
-    ``/joint_states/elbow/position`` becomes ``position_elbow``, likewise velocity, acceleration and
-    effort, and ``__time`` becomes ``time``. A table with standard columns is not changed.
-    """
+    """Return a table with PlotJuggler's ``/topic/elbow/position`` as ``position_elbow``."""
     topics: dict[str, dict[str, str]] = {}  # standard names by name in the file, by topic
     is_standard = any(name.startswith(("q_", "position_")) for name in table.names)
     for name in table.names if _CLOCK in table.names or not is_standard else ():
@@ -216,21 +208,18 @@ def with_standard_names(table: Table, where: str, kind: str, source: LogSource) 
         note = f"the topic {source.topic!r} is not used: {kind} have none"
         table = replace(table, notes=(*table.notes, note))
     names = {_CLOCK: "time"} if _CLOCK in table.names and "time" not in table.names else {}
-    return table.with_names(names | (topics[_topic(topics, where, source)] if topics else {}))
-
-
-def _topic(topics: Mapping[str, Mapping[str, str]], where: str, source: LogSource) -> str:
-    """Return the stated topic, or the only one (with efforts, if any topic has efforts)."""
-    if source.topic is None:
-        moved = [x for x, names in topics.items() if any("effort_" in y for y in names.values())]
+    if topics and source.topic is None:  # the only one, with efforts if any topic has efforts
+        moved = [x for x, own in topics.items() if any("effort_" in y for y in own.values())]
         words = "its columns have names as <topic>/<joint>/position"
-        return choose(where, moved or list(topics), "topics of joint states", words)
-    if source.topic not in topics:
+        names |= topics[choose(where, moved or list(topics), "topics of joint states", words)]
+    elif topics and source.topic not in topics:
         raise DataError(
             f"{where} has no topic {source.topic!r}; topics: {listed(topics)}"
-            f"{suggestion(source.topic, topics)}"
+            f"{suggestion(str(source.topic), topics)}"
         )
-    return source.topic
+    elif topics:
+        names |= topics[str(source.topic)]
+    return table.with_names(names)
 
 
 def with_stated_names(table: Table, where: str, names: Sequence[str]) -> Table:

@@ -132,10 +132,7 @@ def check_excitation(
     model: RobotModel, mapping: BaseMapping, motions: Sequence[Trajectory],
     signals: SignalSettings, name: str,
 ) -> Iterator[Finding]:  # fmt: skip
-    """Yield which base parameters the fitted motions determine, by ``determine``.
-
-    Of long logs every n-th row is used.
-    """
+    """Yield which base parameters the fitted motions determine, by ``determine``."""
     prior, step = model.standard_parameters(), -(-max(len(m.t) for m in motions) // _ROWS)
     thinned = [motion.every(step) for motion in motions]
     try:

@@ -15,7 +15,6 @@ from robotid.base.findings import Finding, listed, toml_key
 from robotid.base.typing import Array
 from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import Round, select
 from robotid.diagnosis.residual.term_trials import Sample, Trials
 from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.estimation.fitting.fitted import Fit
@@ -38,9 +37,7 @@ class Misfit:
 
     joint: str
     term: Candidate
-    #: Share of the joint's squared residual in held-out segments that it explains beyond the terms
-    #: found before it [-].
-    share: float
+    share: float  # of the joint's squared residual that it explains beyond those before it [-]
     p_value: float  # of that share [-]
     confirmed: float | None  # the same share on the validation logs; None without one
     size: float  # its parameter, or its RMS torque, see the units of the term
@@ -51,8 +48,7 @@ class Misfit:
     theta: Array  # (c,), parameters of its columns
     scale: JointMotion  # the motion that sets the scale of its columns
     entries: tuple[str | DriveTerm, ...] = ()  # of the joint in [drives] that add it
-    #: Change of the friction at the RMS speed per minute, and its standard error [N m/min or
-    #: N/min], of a drift with time; NaN of other terms.
+    #: Of a drift: change of the friction at the RMS speed [N m/min, N/min], and standard error.
     trend: tuple[float, float] = (math.nan, math.nan)
 
     def torque(self, motion: JointMotion) -> Array:
@@ -93,56 +89,36 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
         return  # of a torque of 0 there is no relative error
     periodic = ripples(motion.at(fitted), weight, sample.r[fitted, j])
     every = (*CANDIDATES, *couplings(motion), *periodic)
-    offered_terms = [c for c in every if not (c.revolute_only and is_prismatic)]
-    columns = [candidate.columns(motion) for candidate in offered_terms]
-    ends = np.cumsum([x.shape[1] for x in columns]).tolist()
-    place = {
-        candidate: list(range(end - x.shape[1], end))
-        for candidate, x, end in zip(offered_terms, columns, ends, strict=True)
+    columns = {
+        candidate: candidate.columns(motion)[:, None]
+        for candidate in every
+        if not (candidate.revolute_only and is_prismatic)
     }
-    trials = Trials(sample.of_joint(j), np.hstack(columns)[:, None])
-    held_out, whole = trials.held_out, trials.whole
-    chosen: list[int] = []
-    total = before = held_out.left([])
-    squares = float(total[: sample.fitted].sum())
+    trials, place = Trials.of(sample.of_joint(j), columns)
+    squares = float(trials.held_out.left([])[: sample.fitted].sum())
     error = float(np.sqrt(squares / sample.torque[j]))
     angle = 0.0 if is_prismatic else float(np.ptp(motion.q[fitted]))
-
-    def offered() -> Round[Candidate]:
-        left = held_out.left_each({c: [*chosen, *place[c]] for c in offered_terms})
-        return Round(before, left, sample.fitted, squares)
-
-    rounds = select(offered, decisions.MISFIT, lambda c: len(place[c]), attrgetter("tried"))
-    for this, best in rounds:
-        if best is None:
-            return
-        share, new = this.share(best), place[best]
-        every_new, with_new = [*chosen, *new], slice(len(chosen), None)
-        estimate, covariance = whole.estimate(every_new, sample.fitted)
-        estimate, covariance = estimate[with_new], covariance[with_new, with_new]
-        S = whole.S[new][:, new] / np.sum(weight**2)
-        size, std_error = _size(best, estimate, covariance, S)
-        unit = (best.units or ("N m rms", "N rms"))[int(is_prismatic)]
+    for accepted in trials.accepted(
+        place, decisions.MISFIT, lambda c: len(place[c]), attrgetter("tried"),
+        lambda one, other: one.code == other.code,
+    ):  # fmt: skip
+        best, new, theta = accepted.option, place[accepted.option], accepted.theta
+        S = trials.whole.S[new][:, new] / np.sum(weight**2)
+        size, std_error = _size(best, theta, accepted.covariance, S)
         trend = (math.nan, math.nan)
         if best.code == "drift":
             speed = float(np.sqrt(np.mean(motion.v[fitted] ** 2)))
             per_minute = np.array([1.0, speed, 0.0]) * 60.0 / motion.longest  # direction, v and 1
-            trend_error = float(np.sqrt(per_minute @ covariance @ per_minute))
-            trend = float(per_minute @ estimate), trend_error
-        theta = whole.parameters(every_new)[with_new]
+            trend_error = float(np.sqrt(per_minute @ accepted.covariance @ per_minute))
+            trend = float(per_minute @ theta), trend_error
         families = [name for name in best.families if has_turned(name, angle)]
-        unfitted = [
-            float(whole.left(which)[sample.fitted :].sum()) for which in ([], chosen, every_new)
-        ]
-        if np.sqrt(share) * error >= decisions.MISFIT_REPORTED:
+        if np.sqrt(accepted.share) * error >= decisions.MISFIT_REPORTED:
             yield Misfit(
-                sample.joints[j], best, share, this.p_value(best),
-                (unfitted[1] - unfitted[2]) / unfitted[0] if unfitted[0] > 0 else None,
-                size, std_error, unit, error, -whole.T[: len(sample.U), new] @ theta, theta,
-                motion, tuple(families[:1]) or best.terms, trend,
+                sample.joints[j], best, accepted.share, accepted.p_value, accepted.confirmed,
+                size, std_error, (best.units or ("N m rms", "N rms"))[int(is_prismatic)], error,
+                -trials.whole.T[: len(sample.U), new] @ theta, theta, motion,
+                tuple(families[:1]) or best.terms, trend,
             )  # fmt: skip
-        chosen = every_new
-        before, offered_terms = this.left[best], [c for c in offered_terms if c.code != best.code]
 
 
 def _size(term: Candidate, theta: Array, covariance: Array, S: Array) -> tuple[float, float]:
@@ -160,18 +136,13 @@ class Candidate:
 
     name: str  # Its name
     code: str  # Code of the finding that reports it
-    #: Columns of its c parameters in N samples, shape (N, c). They are scaled by the motion given,
-    #: unless that names another motion
-    columns: Callable[[JointMotion], Array]
+    columns: Callable[[JointMotion], Array]  # (N, c), scaled by that motion or the one it names
     meaning: str  # Description of the term for a finding
     advice: str = ""  # Remedy other than adding it to the model; empty if none
-    #: Unit of the parameter of a revolute and of a prismatic joint; None: the size is the RMS
-    #: torque of the term
+    #: Unit of the parameter of a revolute and a prismatic joint; None: its size is an RMS torque.
     units: tuple[str, str] | None = None
     revolute_only: bool = False  # Whether only a revolute joint has it
-    #: Friction families of a job that contain it, see ``FAMILIES``. The first one for which the
-    #: joint moved far enough is advised
-    families: tuple[str, ...] = ()
+    families: tuple[str, ...] = ()  # of ``FAMILIES`` that contain it, the best advice first
     #: Terms of a job's [drives] that are equal to it, if no family is
     terms: tuple[DriveTerm, ...] = ()
     tried: int = 1  # Number of such terms among which the residual selected it
@@ -263,8 +234,7 @@ def _coupled(m: JointMotion, other: str, ratio: float) -> Array:
     return np.column_stack([partner.a, partner.v, np.tanh(w / (_REVERSES * _rms(m, drive_speed)))])
 
 
-#: The candidates of each joint, without couplings: Coulomb friction where the model lacks it, the
-#: families of drive terms, and effects that no term models.
+#: The candidates of each joint, without couplings and ripples, an entry each.
 CANDIDATES = (
     Candidate(
         "coulomb", "friction_shape", lambda m: m.direction[:, None], "Coulomb friction",
@@ -301,10 +271,7 @@ def couplings(motion: JointMotion) -> tuple[Candidate, ...]:
 
 
 def setting_of(misfit: Misfit, fit: Fit) -> str:
-    """Return the entry of a job file that adds a term to the model; empty if there is none.
-
-    It is a line of [drives] that includes the present terms of the joint, or a table [[coupling]].
-    """
+    """Return the entry of a job file that adds a term to the model; empty if there is none."""
     joint, other = misfit.joint, misfit.term.coupled
     if other:
         ratios = f"{toml_key(joint)} = 1.0, {toml_key(other)} = {misfit.term.ratio}"
@@ -327,11 +294,9 @@ def with_entries(fit: Fit, joint: str, entries: Sequence[str | DriveTerm]) -> st
 
 
 def settled(before: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Finding]:
-    """Return the findings before and of the fit, without hypotheses that a term explains.
-
-    The doctor's model has no springs: it attributes a torque that depends on the position to wrong
-    masses, or to nothing. The term that explains it is then a warning, even if it is small.
-    """
+    """Return the findings before and of the fit, without hypotheses that a term explains."""
+    # The doctor attributes a torque that depends on the position to wrong masses. The term that
+    # explains it is then a warning, even if it is small.
     rest, terms = list(before), []
     for term in of_fit:
         hypotheses = [f for f in rest if _explains(term, f)]

@@ -1,29 +1,33 @@
 """Samples of the recordings for tests of terms, and trials of columns added to the regressor.
 
-Columns Z of a candidate term are added to the regressor. Its parameters theta are refitted together
-with the base parameters, with one segment of the logs held out after the other:
+Columns Z are added to the regressor. Their parameters theta are refitted with the base parameters,
+with one segment of the logs held out after the other:
 
     r = W delta + Z theta + e,    theta = (Z^T M Z)^-1 Z^T M r,    M = 1 - W (W^T W + C^-1)^-1 W^T,
 
-so that what base parameters can explain does not count (Frisch, Waugh 1933). C is their prior
-covariance. A term that is not in the data does not reduce the residual of held-out segments.
+so that what base parameters, with prior covariance C, can explain does not count (Frisch, Waugh
+1933). A term that is not in the data does not reduce the residual of held-out segments.
+``Trials.accepted`` is the one comparison of all readings: of the drives' terms (``misfit``) and of
+recordings and the URDF (``discrepancies``).
 
 With constraint forces eliminated, the torque z of joint j is P e_j z in all rows, along the unit
 vector u = P e_j / sqrt(P_jj). The equation of the joint alone is that along u: row j of the
 projected rows over sqrt(P_jj), where the column is sqrt(P_jj) z.
 """
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+import operator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TypeVar
+from typing import Any, Generic
 
 import numpy as np
 
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
-from robotid.diagnosis.decisions import FAMILY_P_VALUE, FEWEST, OUTLIER, SEGMENTS, SHORTEST, p_value
+from robotid.diagnosis import decisions
+from robotid.diagnosis.decisions import Option, Round, Rule, p_value, select
 from robotid.diagnosis.logs.channels import distance
 from robotid.dynamics.constraint_rows import without_forces
 from robotid.dynamics.prepared_logs import independent_share
@@ -33,16 +37,13 @@ from robotid.estimation.fitting.evaluation import Evaluation, Recording
 from robotid.estimation.fitting.fitted import Solution
 from robotid.robot.model import RobotModel
 
-#: Smallest share of a column that the regressor must not explain.
-RIDGE = 1e-4
+RIDGE = 1e-4  # Smallest share of a column that the regressor must not explain
 _ROWS = 3000  # samples of all fitted logs together, and of all validation logs
 _NUMBERS = 2**24  # elements of their regressor
 _PER_INDEPENDENT = 2.0  # samples per independent one behind the filter
 _NEAR = 0.5  # periods of the filter's cut-off
 _FREE = 1e3  # prior spread of an added column, in residuals
 _SHORTEST_UNIT = 1e-4  # rows with a smaller sqrt(P_jj) are not used
-
-OptionT = TypeVar("OptionT", bound=Hashable)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,10 +87,9 @@ class Normal:
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Samples of the recordings, weighted for each joint by its RMS residual, 0 where not used.
+    """Samples of the recordings, weighted for each joint by its RMS residual, 0 where not used."""
 
-    Rows of a floating base precede those of the n joints.
-    """
+    # Rows of a floating base precede those of the n joints.
 
     joints: tuple[str, ...]
     is_prismatic: Array  # (n,), bool
@@ -97,15 +97,13 @@ class Sample:
     recordings: tuple[Recording, ...]  # the fitted ones, then those of validation, if used
     at: tuple[Trajectory, ...]  # their motions at these samples
     taken: tuple[Array, ...]  # indices of these samples in each recording
-    #: (N, n_rows), weights of the torques [1/(N m), 1/N]; one for all rows if constraint forces
-    #: were eliminated.
-    weight: Array
+    weight: (
+        Array  # (N, n_rows), of torques [1/(N m), 1/N]; alike if constraint forces are eliminated
+    )
     torque: Array  # (n_rows,), weighted sum of the squared torques of fitted samples
     segments: tuple[slice, ...]  # samples of each of the K segments, of validation logs last
     rows: int  # number of samples of fitted logs
-    #: (N, n_rows, b), regressor of the base parameters over their prior spread, and columns that
-    #: are refitted with them.
-    W: Array
+    W: Array  # (N, n_rows, b), regressor of base parameters over their spread, and more columns
     r: Array  # (N, n_rows), residual of the estimate
     independent: Array  # (b,), columns of the regressor that belong to base parameters
     U: Array  # (b, b), factor of the prior covariance of base parameters, C = U^T U
@@ -185,7 +183,7 @@ def take_sample(fit: Solution, *, for_drives: bool = False, is_free: bool = Fals
     own = sum(map(len, rows[: len(fit.fitted)]))
     segments = _segments(own, sum(map(len, rows)) - own, independent)
     number = sum(part.stop <= own for part in segments)
-    if number < FEWEST:
+    if number < decisions.FEWEST:
         return None
     motion = [e.recording.trajectory.at(k) for e, k in parts]
     Y = np.concatenate([_regressor(model, e.recording.trajectory, k) for e, k in parts])
@@ -219,10 +217,8 @@ def take_sample(fit: Solution, *, for_drives: bool = False, is_free: bool = Fals
 
 
 def _free(sample: Sample, X: Array) -> Sample:
-    """Return the samples with the bodies of least squares, if these predict held-out segments.
-
-    A prior that is wrong binds the bodies, and its error looks like friction.
-    """
+    """Return the samples with the bodies of least squares, if these predict held-out segments."""
+    # A prior that is wrong binds the bodies, and its error looks like friction.
     W = sample.weight[..., None] * X
     size = np.linalg.norm(W[: sample.rows], axis=(0, 1))
     spread = _FREE * np.linalg.norm(sample.r) / np.where(size > 0, size, np.inf)
@@ -231,7 +227,7 @@ def _free(sample: Sample, X: Array) -> Sample:
     free = replace(sample, W=W, U=np.diag(spread), normal=normal)
     none = np.empty((*sample.r.shape, 0))
     before, after = (Trials(x, none).held_out.left([]) for x in (sample, free))
-    if p_value(before, after, sample.fitted) >= FAMILY_P_VALUE:
+    if p_value(before, after, sample.fitted) >= decisions.FAMILY_P_VALUE:
         return sample
     change = normal.whole[1] @ normal.B[: sample.fitted].sum(axis=0)
     standard = sample.standard.copy()
@@ -279,7 +275,11 @@ def _segments(fitted: int, validation: int, independent: float) -> tuple[slice, 
     """Return the segments of the samples of fitted and of validation recordings."""
     edges = [0]
     for rows in (fitted, validation):
-        count = min(SEGMENTS, max(1, int(rows * independent / SHORTEST))) if rows else 0
+        count = (
+            min(decisions.SEGMENTS, max(1, int(rows * independent / decisions.SHORTEST)))
+            if rows
+            else 0
+        )
         first = edges[-1]
         edges += [first + rows * (i + 1) // count for i in range(count)]
     return tuple(slice(*pair) for pair in pairwise(edges))
@@ -305,15 +305,13 @@ def _lengths(basis: Array) -> Array:
 
 
 def _noise_level(r: Array, used: Array, own: int, basis: Array | None) -> tuple[Array, Array]:
-    """Return the used rows without outliers, and the RMS residual of each row, (n_rows,).
-
-    Rows that were projected together have one noise level, and an outlier excludes its sample.
-    """
+    """Return the used rows without outliers, and the RMS residual of each row, (n_rows,)."""
+    # Rows that were projected together have one noise level, and an outlier excludes its sample.
     u = np.ones(r.shape) if basis is None else _lengths(basis)
     size = np.abs(r) / u
     columns = zip(size[:own].T, used[:own].T, strict=True)
     typical = np.array([np.median(x[at]) if at.any() else np.inf for x, at in columns])
-    usual: Array = size <= OUTLIER * typical
+    usual: Array = size <= decisions.OUTLIER * typical
     if basis is not None:
         usual = np.all(usual | ~used, axis=1, keepdims=True)
     used = used & usual
@@ -325,10 +323,8 @@ def _noise_level(r: Array, used: Array, own: int, basis: Array | None) -> tuple[
 
 
 def _is_steady(recording: Recording) -> Array:
-    """Return the samples that are far from reversals and rest of each joint, shape (N, n), bool.
-
-    Near these the filter smears stiction, which then does not look like friction.
-    """
+    """Return the samples that are far from reversals and rest of each joint, shape (N, n), bool."""
+    # Near these the filter smears stiction, which then does not look like friction.
     motion, signals = recording.trajectory, recording.signals
     if signals.cutoff is None:
         return np.ones(motion.v.shape, dtype=bool)
@@ -360,11 +356,8 @@ class Trial:
         return np.asarray(np.linalg.solve(products, S[..., k, -1][..., None])[..., 0])
 
     def estimate(self, which: Sequence[int], fitted: int) -> tuple[Array, Array]:
-        """Return the parameters of some columns and their covariance, shapes (k,) and (k, k).
-
-        Of a fit to all samples. The covariance is that of clusters: from the scatter of the scores
-        between segments, valid for noise of any colour.
-        """
+        """Return the parameters of some columns and their covariance, shapes (k,) and (k, k)."""
+        # From the scatter of the scores between segments: valid for noise of any colour.
         theta, S = self.parameters(which), self.S[which][:, which]
         H = self.H[:fitted, which]
         scores = H[:, :, -1] - H[:, :, which] @ theta  # (K, k)
@@ -381,24 +374,38 @@ class Trial:
         square = self.H[:, with_r[..., :, None], with_r[..., None, :]]
         return np.asarray((x[..., None, :] @ square @ x[..., :, None])[..., 0, 0])
 
-    def left_each(self, choices: Mapping[OptionT, Sequence[int]]) -> dict[OptionT, Array]:
+    def left_each(self, choices: Mapping[Option, Sequence[int]]) -> dict[Option, Array]:
         """Return the squared residual of each segment with columns of each option, shapes (K,)."""
         return _each(choices, lambda which: self.left(which).T)
 
-    def parameters_each(self, choices: Mapping[OptionT, Sequence[int]]) -> dict[OptionT, Array]:
+    def parameters_each(self, choices: Mapping[Option, Sequence[int]]) -> dict[Option, Array]:
         """Return the parameters of columns of each option, shapes (k,), of a fit to all samples."""
         return _each(choices, self.parameters)
 
 
 def _each(
-    choices: Mapping[OptionT, Sequence[int]], of: Callable[[Array], Array]
-) -> dict[OptionT, Array]:
+    choices: Mapping[Option, Sequence[int]], of: Callable[[Array], Array]
+) -> dict[Option, Array]:
     """Evaluate a function of the columns of each option, all options of one size together."""
-    results: dict[OptionT, Array] = {}
+    results: dict[Option, Array] = {}
     for size in {len(which) for which in choices.values()}:
         alike = {x: which for x, which in choices.items() if len(which) == size}
         results.update(zip(alike, of(np.array([*alike.values()])), strict=True))
     return {x: results[x] for x in choices}
+
+
+@dataclass(frozen=True, eq=False)
+class Accepted(Generic[Option]):
+    """An option that was selected, fitted together with those selected before."""
+
+    option: Option
+    others: list[Option]  # that explain about the same
+    share: float  # of the squared residual of fitted logs that it removes [-]
+    p_value: float  # of that share [-]
+    confirmed: float | None  # the same share on validation logs; None without one
+    columns: list[int]  # of all selected options, its own c last
+    theta: Array  # (c,), its parameters
+    covariance: Array  # (c, c), of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -409,6 +416,17 @@ class Trials:
     Z: Array  # (N, n, c), torques of parameters of 1
     ridge: float = RIDGE
 
+    @classmethod
+    def of(
+        cls, sample: Sample, columns: Mapping[Option, Array]
+    ) -> tuple["Trials", dict[Option, list[int]]]:
+        """Return the trials of the columns (N, n, c) of options, and the place of each."""
+        ends = np.cumsum([Z.shape[2] for Z in columns.values()]).tolist()
+        each = zip(columns.items(), ends, strict=True)
+        place = {option: list(range(end - Z.shape[2], end)) for (option, Z), end in each}
+        none = np.empty((*sample.r.shape, 0))  # there may be no options
+        return cls(sample, np.concatenate([none, *columns.values()], axis=2)), place
+
     @cached_property
     def held_out(self) -> Trial:
         """Fitted without the segment that is evaluated."""
@@ -418,6 +436,39 @@ class Trials:
     def whole(self) -> Trial:
         """Fitted to all segments of fitted logs."""
         return self._trial(*self.sample.normal.whole)
+
+    def accepted(
+        self,
+        offered: Mapping[Option, Sequence[int]],
+        rule: Rule,
+        cost: Callable[[Option], Any],
+        tried: Callable[[Option], int] = lambda option: 1,
+        excludes: Callable[[Option, Option], bool] = operator.eq,
+    ) -> Iterator[Accepted[Option]]:
+        """Yield the options that explain the residual, one after the other, by their columns."""
+        held_out, fitted, columns = self.held_out, self.sample.fitted, list[int]()
+        alone = before = held_out.left([])
+        of_fitted, of_validation = (float(x.sum()) for x in np.split(alone, [fitted]))
+
+        def compared() -> Round[Option]:
+            left = held_out.left_each({x: [*columns, *own] for x, own in offered.items()})
+            return Round(before, left, fitted, of_fitted)
+
+        for trial, best in select(compared, rule, cost, tried):
+            if best is None:
+                return
+            columns += offered[best]
+            theta, covariance = self.whole.estimate(columns, fitted)
+            new, confirmed = slice(-len(offered[best]), None), None
+            if len(alone) > fitted:
+                gain = float((before - trial.left[best])[fitted:].sum())
+                confirmed = gain / max(of_validation, decisions.NOTHING)
+            others = [x for x in trial.alike(rule, tried) if x != best]
+            share, chance = trial.share(best), trial.p_value(best)
+            parameters = columns.copy(), theta[new], covariance[new, new]
+            yield Accepted(best, others, share, chance, confirmed, *parameters)
+            before = trial.left[best]
+            offered = {x: own for x, own in offered.items() if not excludes(x, best)}
 
     @cached_property
     def _rows(self) -> list[tuple[Array, Array]]:

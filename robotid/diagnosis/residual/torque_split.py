@@ -17,18 +17,8 @@ from functools import cached_property
 import numpy as np
 
 from robotid.base.typing import Array
+from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import sentence_of
-from robotid.diagnosis.decisions import (
-    FEWEST,
-    LEAST_SHARE,
-    OUTLIER,
-    P_VALUE,
-    ROUNDING,
-    SCATTERED,
-    SEGMENTS,
-    SHORTEST,
-    p_value,
-)
 from robotid.dynamics.prediction import predict, rigid_parts
 from robotid.dynamics.prepared_logs import independent_share
 from robotid.dynamics.rows import drive_values, friction_directions
@@ -46,11 +36,9 @@ _BINS = 10  # of a quantity, with equal numbers of samples
 
 @dataclass(frozen=True, eq=False)
 class TorqueSplit:
-    """Parts of predicted torques.
+    """Parts of predicted torques."""
 
-    These are "gravity", "inertia" and "Coriolis" (with centrifugal torques) of the bodies, then the
-    torques of the drives, by ``DriveTerm.part``.
-    """
+    # "gravity", "inertia", "Coriolis" of bodies, then those of drives, by ``DriveTerm.part``.
 
     parts: Mapping[str, Array]  # each of shape (N, n_rows) [N m, N]
     names: tuple[str, ...]  # of the k drive parameters
@@ -78,10 +66,8 @@ def split_torque(
     model: RobotModel, pi: Array, q: Array, v: Array, a: Array,
     direction: Array | None = None, memory: Array | None = None,
 ) -> TorqueSplit:  # fmt: skip
-    """Return the parts of the torques that parameters predict.
-
-    A static model has no torques of motion: gravity is the only part of the bodies.
-    """
+    """Return the parts of the torques that parameters predict."""
+    # A static model has no torques of motion: gravity is the only part of the bodies.
     layout, first = model.layout, model.n_rows - len(model.joints)
     parts = dict(zip(_RIGID, rigid_parts(model, pi, q, v, a), strict=True))
     if model.is_static:
@@ -112,19 +98,16 @@ class Rows:
         starts = np.flatnonzero(np.diff(self.recording, prepend=-1))
         if len(starts) == 1:
             return self.t
-        lengths = np.array([np.ptp(self.t[self.recording == k]) for k in range(len(starts))])
-        before = np.concatenate([[0.0], np.cumsum(lengths)[:-1]])
-        return np.asarray(self.t - self.t[starts][self.recording] + before[self.recording])
+        lengths = [np.ptp(part) for part in np.split(self.t, starts[1:])]
+        shift = np.cumsum([0.0, *lengths[:-1]]) - self.t[starts]
+        return np.asarray(self.t + shift[self.recording])
 
     @cached_property
     def pieces(self) -> Array:
         """Piece of each sample, 16 per recording, numbered on, shape (N,), int."""
-        count = _QUARTERS**2
-        pieces = np.empty(len(self.t), dtype=int)
-        for k in range(len(self.recordings)):
-            own = self.recording == k
-            pieces[own] = count * k + np.arange(own.sum()) * count // max(own.sum(), 1)
-        return pieces
+        rows, count = np.bincount(self.recording), _QUARTERS**2
+        place = np.arange(len(self.t)) - np.repeat(np.cumsum(rows) - rows, rows)
+        return np.asarray(count * self.recording + place * count // np.repeat(rows, rows))
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,8 +123,7 @@ class JointTorque:
     terms: Mapping[str, Mapping[str, Array]]  # (N,) of each drive parameter, by part and name
     #: Quantities that the residual may depend on: unit and values, (N,), by name.
     quantities: Mapping[str, tuple[str, Array]]
-    #: Share of the squared residual above the filter's cut-off: not correlated over one period of
-    #: it, or from sample to sample without a filter; None if not available.
+    #: Share of the squared residual above the filter's cut-off, or white; None if not available.
     broadband: float | None
     fitted: JointTorque | None = None  # of the fitted recordings; None if it is of them itself
 
@@ -153,7 +135,7 @@ class JointTorque:
     @cached_property
     def present(self) -> tuple[str, ...]:
         """Names of the parts that are more than rounding in any row."""
-        least = ROUNDING * float(np.abs(self.tau).max())
+        least = decisions.ROUNDING * float(np.abs(self.tau).max())
         return tuple(name for name, x in self.parts.items() if np.abs(x).max() > least)
 
     @property
@@ -168,14 +150,12 @@ class JointTorque:
 
     @cached_property
     def follows(self) -> tuple[Dependence, ...]:
-        """Dependence of the residual on a constant, on each quantity, and on time.
-
-        A quantity is tested together with a constant, time on the residual after the best other.
-        """
+        """Dependence of the residual on a constant, on each quantity, and on time."""
+        # A quantity is tested together with a constant, time on the residual after the best other.
         r = self.residual
         if not self.used.any():
             return ()
-        used = self.used & (np.abs(r) <= OUTLIER * np.median(np.abs(r[self.used])))
+        used = self.used & (np.abs(r) <= decisions.OUTLIER * np.median(np.abs(r[self.used])))
         everywhere, piece = np.zeros(int(used.sum()), dtype=int), self.rows.pieces[used]
         segments = None if self.rows.segments is None else self.rows.segments[used]
         tested = [follow("constant", self.unit, r[used], r[used], everywhere, segments)]
@@ -191,10 +171,7 @@ class JointTorque:
 
     @cached_property
     def against_time(self) -> tuple[Array, str]:
-        """The residual that is tested against time, shape (N,), and the subtracted quantity.
-
-        The means over the quantity that explains most are subtracted; "" if there is none.
-        """
+        """The residual that is tested against time, shape (N,), and the subtracted quantity."""
         return self._less_best(self.follows[:-1])
 
     def _less_best(self, tested: Sequence[Dependence]) -> tuple[Array, str]:
@@ -252,11 +229,8 @@ class JointTorque:
 
 
 def joint_torques(fit: Fit) -> tuple[JointTorque, ...]:
-    """Return the torque of each row, its parts, and what its residual depends on.
-
-    The samples, at most 4000, are spread over the validation recordings, or over the fitted ones if
-    there are none.
-    """
+    """Return the torque of each row, its parts, and what its residual depends on."""
+    # At most 4000 samples, of the validation recordings, or of the fitted ones if there are none.
     validation = [e for e in fit.validation if not e.is_refitted]
     fitted = _torques_of(fit, fit.fitted)
     if not validation:
@@ -317,21 +291,19 @@ def _rows(chosen: Sequence[tuple[Evaluation, Array]]) -> Rows:
         min(len(k), independent_share(e.recording.signals) * len(e.recording.trajectory.t))
         for e, k in chosen
     )
-    many, total = min(SEGMENTS, int(independent / SHORTEST)), sum(counts)
+    many, total = min(decisions.SEGMENTS, int(independent / decisions.SHORTEST)), sum(counts)
     return Rows(
         recordings=tuple(e.recording.name for e, _ in chosen),
         t=np.concatenate([e.recording.trajectory.t[k] for e, k in chosen]),
         recording=np.repeat(np.arange(len(chosen)), counts),
         segment=np.concatenate([e.recording.trajectory.segment[k] for e, k in chosen]),
-        segments=np.arange(total) * many // total if many >= FEWEST else None,
+        segments=np.arange(total) * many // total if many >= decisions.FEWEST else None,
     )
 
 
 def _broadband_shares(evaluations: Sequence[Evaluation]) -> list[float | None]:
-    """Return the broadband share of each row's squared residual, as of filtered noise.
-
-    It is 1 - r(L) / r(0) with r the autocovariance and L a period of the filter's cut-off.
-    """
+    """Return the broadband share of each row's squared residual, as of filtered noise."""
+    # It is 1 - r(L) / r(0) with r the autocovariance and L a period of the filter's cut-off.
     rows = evaluations[0].recording.mask.shape[1]
     squares, products = np.zeros(rows), np.zeros(rows)
     for e in evaluations:
@@ -362,18 +334,19 @@ class Dependence:
     unit: str  # of the quantity
     centres: Array  # (B,), mean of the quantity in each bin
     means: Array  # (B,), mean residual in each bin [N m or N]
-    #: (B,), standard error of these means, from their scatter between segments; NaN in bins of
-    #: fewer than three segments.
-    errors: Array
-    #: Share of the residual's variance that the means of other segments explain; None if there are
-    #: too few segments. A negative share means that they explain nothing.
+    errors: Array  # (B,), standard errors of the means between segments; NaN for fewer than three
+    #: Share of the variance that the means of other segments explain; None with too few segments.
     share: float | None
     p_value: float  # p-value of that share [-]
 
     @property
     def is_significant(self) -> bool:
         """Whether the dependence is significant, and large enough to matter."""
-        return self.share is not None and self.share >= LEAST_SHARE and self.p_value < P_VALUE
+        return (
+            self.share is not None
+            and self.share >= decisions.LEAST_SHARE
+            and self.p_value < decisions.P_VALUE
+        )
 
     @property
     def where(self) -> float:
@@ -392,13 +365,11 @@ class Dependence:
 def follow(
     name: str, unit: str, x: Array, r: Array, bins: Array, segments: Array | None
 ) -> Dependence:
-    """Return the dependence of a residual on a quantity.
-
-    With N_kb samples and the sum S_kb of their residuals in segment k and bin b, the mean of a bin
-    is m_b = sum_k S_kb / n_b. Its variance is sum_k (S_kb - N_kb m_b)^2 / n_b^2, for independent
-    clusters (Liang, Zeger 1986). The squared residual of segment k after the means of the other
-    segments is compared with that after their common mean; for a single bin, with that around 0.
-    """
+    """Return the dependence of a residual on a quantity."""
+    # m_b = sum_k S_kb / n_b for N_kb samples with the sum S_kb in segment k and bin b; its variance
+    # is sum_k (S_kb - N_kb m_b)^2 / n_b^2, for independent clusters (Liang, Zeger 1986). Each
+    # segment is predicted by the means of the others and by their common mean; a single bin by them
+    # and by 0.
     n = np.bincount(bins).astype(float)
     centres, means = np.bincount(bins, x) / n, np.bincount(bins, r) / n
     if segments is None:
@@ -411,8 +382,8 @@ def follow(
     Q = np.bincount(segment, r**2)
     present = (N > 0).sum(axis=0)
     scatter = np.sum((S - N * means) ** 2, axis=0) * present / np.maximum(present - 1, 1)
-    errors = np.where(present >= SCATTERED, np.sqrt(scatter) / n, np.nan)
-    if K < FEWEST:
+    errors = np.where(present >= decisions.SCATTERED, np.sqrt(scatter) / n, np.nan)
+    if K < decisions.FEWEST:
         return Dependence(name, unit, centres, means, errors, None, 1.0)
     N_other, S_other = n - N, S.sum(axis=0) - S  # of all segments but one
     plain = (S_other.sum(axis=1) / N_other.sum(axis=1))[:, None] * (B > 1)  # with a constant
@@ -422,7 +393,9 @@ def follow(
     )
     whole = float(before.sum())
     share = 1.0 - float(after.sum()) / whole if whole > 0 else 0.0  # 0 for a residual of 0
-    return Dependence(name, unit, centres, means, errors, share, p_value(before, after, K))
+    return Dependence(
+        name, unit, centres, means, errors, share, decisions.p_value(before, after, K)
+    )
 
 
 def even_bins(x: Array) -> Array:
@@ -432,10 +405,8 @@ def even_bins(x: Array) -> Array:
 
 
 def friction_split(model: RobotModel, evaluation: Evaluation, pi: Array) -> tuple[Array, Array]:
-    """Return the measured torque without rigid-body torques, and the identified friction.
-
-    The first is tau - Y pi with pi without friction and offset, the second their torque.
-    """
+    """Return the measured torque without rigid-body torques, and the identified friction."""
+    # tau - Y pi, with pi without friction and offset, and their torque.
     layout, trajectory = model.layout, evaluation.recording.trajectory
     is_drive_inertia = [term.is_inertia for _, term in layout.drive_parameters]
     stiff = np.array([True] * layout.n_inertial + is_drive_inertia)

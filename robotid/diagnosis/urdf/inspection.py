@@ -27,8 +27,7 @@ from robotid.dynamics.torque import random_regressor
 from robotid.robot.bodies import LinkPlace, link_places
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import with_assumed_inertials
-from robotid.robot.tree import MOVABLE
-from robotid.robot.urdf_text import number_fault, numbers, parse_urdf, read_with_yourdfpy
+from robotid.robot.tree import MOVABLE, number_fault, numbers, parse_urdf, read_with_yourdfpy
 
 # the attributes that hold numbers, by the element they are in
 _NUMBERS = {

@@ -30,15 +30,16 @@ from robotid.robot.parameters import pseudo_inertia
 _BIASED = 0.5, 2.0  # shift of a parameter by encoder noise, in standard errors: note, warning
 _COARSE = 0.1  # share of encoder noise over the largest one, from which a joint is named
 _DIFFERS = 1.2  # residual of a consistent fit over that of WLS above which it is reported
-_SHRUNK = 0.1  # of the URDF's smallest eigenvalue: below, a body is barely possible
-_MUCH = 0.2  # ... if links on locked joints have more than this share of its mass
+# Of the URDF's smallest eigenvalue: below, a body is barely possible, if links on locked joints
+# have more than this share of its mass.
+_SHRUNK, _MUCH = 0.1, 0.2
 _USER_BOUNDS = ("mass ", "total_mass ", "centre_of_mass ")
 _DENSEST = 12_000.0  # [kg/m^3] of a link: lead has 11,340
 _UNLIKELY = 0.05  # share of the bodies that the errors allow below which one is not possible
 _AT_BOUND = 1e-3  # relative difference of a mass from a stated bound that determines it
 _VANISHED = 0.05  # share of a link's URDF mass below which the link has practically vanished
-_LEFT = 1 / 3  # largest share of the squared error that a gain of the torque leaves
-_MOSTLY = 0.6  # share of friction in a torque from which friction may have changed, too
+# Of the squared error, that a gain of the torque leaves; of friction, which may have changed, too.
+_LEFT, _MOSTLY = 1 / 3, 0.6
 
 
 def fit_findings(
@@ -56,7 +57,7 @@ def fit_findings(
             base=len(determined.names),
         )  # fmt: skip
     yield from consistency_findings(fit)
-    at_bound = [x for x, is_at in zip(fit.model.layout.names, fit.at_bound, strict=True) if is_at]
+    at_bound = np.array(fit.model.layout.names)[fit.at_bound].tolist()
     if at_bound:
         joints = list(dict.fromkeys(name.rpartition(".")[0] for name in at_bound))
         names = listed(at_bound, NAMED)
@@ -67,18 +68,20 @@ def fit_findings(
     if fit.outliers:
         yield _of_outliers(fit)
     yield from (misfit_finding(misfit, fit, on_misfit) for misfit in misfits)
-    yield from (*_drive_findings(fit), *_correlated(fit), *discrepancies, *encoder_noise(fit))
+    yield from (
+        *_drive_findings(fit),
+        *correlated_findings(fit),
+        *discrepancies,
+        *encoder_noise(fit),
+    )
     for e in fit.refitted:
         yield finding("validation_was_fitted", subject=e.recording.log.path, name=e.recording.name)
     yield from _costs(fit)
 
 
 def _costs(fit: Fit) -> Iterator[Finding]:
-    """Yield the joints whose torque error the constraints increase.
-
-    It is a note if they add little, sqrt(error^2 - wls^2) of the torque, the verdict does not count
-    it, and the user states no constraint; and if WLS predicts unseen recordings worse.
-    """
+    """Yield the joints whose torque error the constraints increase."""
+    # A note if they add little, sqrt(error^2 - wls^2), unless stated; or if WLS predicts worse.
     wls, settings, locked = fit.metrics("wls").per_joint, fit.estimator, _locked_links(fit)
     asked = ""  # the constraints that the user states
     if isinstance(settings, BoundedSettings) and any(settings.constraints.values()):
@@ -141,11 +144,8 @@ def _drive_findings(fit: Fit) -> Iterator[Finding]:
                     )  # fmt: skip
 
 
-def _correlated(fit: Fit) -> Iterator[Finding]:
-    """Yield notes on drives with parameters of which only the sum is determined.
-
-    They have a strongly correlated pair, or terms that increase another standard error tenfold.
-    """
+def correlated_findings(fit: Fit) -> Iterator[Finding]:
+    """Yield notes on drives with parameters of which only the sum is determined."""
     names, pairs = fit.model.layout.names, correlated_parameters(fit)
     joints = list(dict.fromkeys(names[i].rpartition(".")[0] for i in pairs))
     for joint in joints:
@@ -178,17 +178,14 @@ def not_written(log_errors: Sequence[Finding], inconsistent: str = "") -> Iterat
     """Yield a warning that the URDF is not written, with the reason; nothing if it is written."""
     codes = listed(dict.fromkeys(error.code for error in log_errors))
     what = "codes" if log_errors else "inconsistent"
-    words = {"what": what, "cure": what, "codes": codes, "estimator": inconsistent}
     if log_errors or inconsistent:
+        words = {"what": what, "cure": what, "codes": codes, "estimator": inconsistent}
         yield finding("urdf_not_written", subject="urdf", **words)
 
 
 def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]:
-    """Return a warning about locked joints whose positions matter but were not stated.
-
-    A position matters if the locked joint is on a chain with an identified joint: the pose of the
-    legs does not change the torques of an arm. On a floating base all positions matter.
-    """
+    """Return a warning about locked joints whose positions matter but were not stated."""
+    # A position matters on a chain with an identified joint; on a floating base all matter.
     relevant = set(model.locked) if model.free_flyer else _in_line(model)
     assumed = [name for name in model.locked if name not in stated and name in relevant]
     return [finding("locked_at_zero", "", assumed)] if assumed else []
@@ -197,11 +194,11 @@ def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]
 def _in_line(model: RobotModel) -> set[str]:
     """Return the joints that carry an identified joint, or are carried by one."""
     above = {joint.child: joint for joint in model.tree.joints}
-    carriers: dict[str, set[str]] = {}
+    carriers: dict[str, set[str]] = {joint.name: set() for joint in model.tree.joints}
     for joint in model.tree.joints:
-        own, link = carriers.setdefault(joint.name, set()), joint.parent
+        link = joint.parent
         while link in above:
-            own.add(above[link].name)
+            carriers[joint.name].add(above[link].name)
             link = above[link].parent
     identified = set(model.joints)
     carrying = set[str]().union(*(carriers[name] for name in identified))
@@ -214,9 +211,9 @@ def log_findings(logs: Sequence[Log]) -> Iterator[Finding]:
     """Yield what was noted and assumed of logs, each once, with the names of its logs."""
     logs_of: dict[tuple[str, str], list[str]] = {}
     for log in logs:
-        for code, texts in (("log_note", log.notes), ("log_assumption", log.assumed)):
-            for text in texts:
-                logs_of.setdefault((code, text), []).append(Path(log.path).name)
+        noted = [("log_note", x) for x in log.notes] + [("log_assumption", x) for x in log.assumed]
+        for key in noted:
+            logs_of.setdefault(key, []).append(Path(log.path).name)
     for (code, text), names in logs_of.items():
         yield finding(code, ", ".join(names), text=text)
 
@@ -249,12 +246,8 @@ def _total_mass(fit: Fit) -> Iterator[Finding]:
     size = fit.model.layout.n_inertial
     pi = np.array([fit.prior, fit.standard])
     before, after = pi[:, :size:10].sum(axis=1).tolist()
-    is_stated = fit.estimator.bounds.total is not None
-    if (
-        not is_stated
-        and before > 0
-        and not before / NO_ERROR_OF_MASSES <= after <= NO_ERROR_OF_MASSES * before
-    ):
+    is_open = fit.estimator.bounds.total is None and before > 0
+    if is_open and not before / NO_ERROR_OF_MASSES <= after <= NO_ERROR_OF_MASSES * before:
         evidence = {"urdf": before, "identified": after, "far": NO_ERROR_OF_MASSES}
         yield finding("total_mass", subject="standard_parameters", **evidence)
 
@@ -294,11 +287,8 @@ def _is_within_box(fit: Fit, body: str, box: Array) -> bool:
 
 
 def _impossible_shapes(fit: Fit) -> Iterator[Finding]:
-    """Yield the identified bodies that are not possible in their geometry.
-
-    As notes if the URDF's body is not possible either, or if the body is in the box of a fit with
-    extents. Bodies of negligible mass are left out.
-    """
+    """Yield the identified bodies that are not possible in their geometry."""
+    # Notes if the URDF's is not either, or in the box of the fit; without negligible bodies.
     model, points = fit.model, body_points(fit.model)
     boxes, negligible = body_boxes(model), negligible_bodies(model)
     before = {(fault.code, fault.where) for fault in audit_bodies(model, fit.prior, points)}
@@ -307,25 +297,23 @@ def _impossible_shapes(fit: Fit) -> Iterator[Finding]:
         if body in negligible:  # it keeps the URDF's values, and has no effect
             continue
         if (fault.code, fault.where) in before:
-            fault = fault.reworded(severity="note", remedy="; the URDF has the same fault")
-        else:
-            fault = fault.reworded(fault=f"as identified, {fault.fault}")
-            remedy = f". {_cure(fit, body)}. The predicted torque may still be right; do not use "
-            remedy += "mass, centre of mass and inertia of this link"
-            if _is_within_box(fit, body, boxes[body]):
-                fault = fault.reworded(severity="note")
-                remedy = "; it is within the margin of the fit"
-            fault = fault.reworded(remedy=remedy)
-        yield fault
+            yield fault.reworded(severity="note", remedy="; the URDF has the same fault")
+            continue
+        severity, remedy = (
+            fault.severity,
+            f". {_cure(fit, body)}. The predicted torque may still be ",
+        )
+        remedy += "right; do not use mass, centre of mass and inertia of this link"
+        if _is_within_box(fit, body, boxes[body]):
+            severity, remedy = "note", "; it is within the margin of the fit"
+        text = f"as identified, {fault.fault}"
+        yield fault.reworded(fault=text, severity=severity, remedy=remedy)
 
 
 def _dense_bodies(fit: Fit) -> Iterator[Finding]:
-    """Yield the identified bodies whose inertia needs a density above that of any material.
-
-    As notes if the errors of mass and inertia allow a body of a material and no stated mass
-    determines it. Bodies that have this density in the URDF are left out, and all of a result that
-    is not physically consistent, which is a reason of its own.
-    """
+    """Yield the identified bodies whose inertia needs a density above that of any material."""
+    # A note if the errors of mass and inertia allow a material, and no stated mass determines it.
+    # Bodies as dense in the URDF are left out.
     if not fit.is_consistent:
         return
     size = fit.model.layout.n_inertial
@@ -372,13 +360,12 @@ def _stated_of(fit: Fit, body: str) -> dict[str, float]:
 
 
 def _of_outliers(fit: Fit) -> Finding:
-    outliers = fit.outliers
+    outliers, more = fit.outliers, len(fit.outliers) - NAMED
     places = "; ".join(
         f"{o.joint} at {o.t:.3f} s of {o.log}: measured {o.torque:.4g}, predicted "
         f"{o.predicted:.4g}, residual {o.size:.0f} times the typical one"
         for o in outliers[:NAMED]
-    )
-    places += f"; and {len(outliers) - NAMED} more" if len(outliers) > NAMED else ""
+    ) + f"; and {more} more" * (more > 0)
     count = f"{len(outliers)} outlier{'s' if len(outliers) > 1 else ''}"
     return finding(
         "outliers", "", outliers[0].joint, count=count, where=places,
@@ -387,10 +374,8 @@ def _of_outliers(fit: Fit) -> Finding:
 
 
 def _locked_links(fit: Fit) -> str:
-    """Return the bodies that links on locked joints make barely possible, as text; empty if none.
-
-    Such links keep the URDF's inertials: the moved link takes all their errors.
-    """
+    """Return the bodies that links on locked joints make barely possible, as text."""
+    # Such links keep the URDF's inertials: the moved link takes all their errors.
     model, size = fit.model, fit.model.layout.n_inertial
     held, identified = held_parameters(model), fit.standard[:size]
     own, before = (
@@ -412,13 +397,11 @@ def _contradiction(fit: Fit) -> tuple[str, dict[str, str]]:
     costs = [joint for joint in ours if ours[joint].rmse > BEATEN * wls[joint].rmse]
     if costs:
         return "costs", {"costs": listed(costs)}
-    layout = fit.model.layout
-    masses = fit.standard[: layout.n_inertial : 10]
-    urdf = fit.model.standard_parameters()[: layout.n_inertial : 10]
+    layout, urdf = fit.model.layout, fit.model.standard_parameters()
+    masses, before = (pi[: layout.n_inertial : 10] for pi in (fit.standard, urdf))
     vanished = [
-        f"{link} has {mass:.2g} of its {before:.3g} kg"
-        for link, mass, before in zip(layout.bodies, masses, urdf, strict=True)
-        if mass < _VANISHED * before
+        f"{layout.bodies[k]} has {masses[k]:.2g} of its {before[k]:.3g} kg"
+        for k in np.flatnonzero(masses < _VANISHED * before)
     ]
     return ("vanished", {"vanished": ", ".join(vanished)}) if vanished else ("harmless", {})
 
@@ -429,14 +412,14 @@ def unlike_findings(variation: Variation | None) -> Iterator[Finding]:
         return
     for unlike in variation.unlike_units:
         name = f"unit {variation.unit_names[unlike.run]}"
-        yield _unlike("unlike_unit", name, unlike, variation.units - 1, "other units")
+        yield _unlike(name, unlike, variation.units - 1, "other units")
     for unlike in variation.unlike:
-        count = len(variation.runs) - 1
-        yield _unlike("unlike_run", variation.runs[unlike.run], unlike, count, "other logs")
+        yield _unlike(variation.runs[unlike.run], unlike, len(variation.runs) - 1, "other logs")
 
 
-def _unlike(code: str, name: str, unlike: UnlikeRun, others: int, rest: str) -> Finding:
+def _unlike(name: str, unlike: UnlikeRun, others: int, rest: str) -> Finding:
     """Return the finding about a log or a unit, with the prediction of the others."""
+    code = "unlike_unit" if rest == "other units" else "unlike_run"
     (low, high), kind = (float(end) for end in unlike.ends), unlike.kind
     sign = "+" if kind == "zero" else ""
     size = f"{unlike.value:{sign}.3g} +- {unlike.std_error:.2g}"
@@ -453,11 +436,8 @@ def _unlike(code: str, name: str, unlike: UnlikeRun, others: int, rest: str) -> 
 
 
 def rescaled_findings(fit: Fit, loaded: Collection[str] = ()) -> Iterator[Finding]:
-    """Yield a finding for each torque of a validation log that is a multiple of its prediction.
-
-    The factor c minimises |tau - c tau_predicted| over the rows used. It is reported if the torque
-    error is above the limit of a good prediction, and the factor removes most of its square.
-    """
+    """Yield a finding for each torque of a validation log that is a multiple of its prediction."""
+    # The c of least |tau - c tau_predicted| of a poor prediction must remove most of its square.
     if fit.model.constraints:  # the rows are projected, and mix the joints
         return
     friction = dict[str, float]()
@@ -468,10 +448,10 @@ def rescaled_findings(fit: Fit, loaded: Collection[str] = ()) -> Iterator[Findin
             continue
         for k, joint in enumerate(fit.model.row_names):
             measured = e.metrics["estimate"].per_joint.get(joint)
-            if joint not in fit.model.joints or measured is None or error_of(measured) <= GOOD:
+            if joint not in fit.model.joints or measured is None:
                 continue
-            if measured.relative_error_pct is None:
-                continue  # the torque is 0: it has no gain
+            if not GOOD < error_of(measured) < np.inf:  # inf: a torque of 0 has no gain
+                continue
             tau, predicted = motion.tau[mask[:, k], k], e.torques["estimate"][mask[:, k], k]
             factor = float(predicted @ tau) / max(float(predicted @ predicted), 1e-300)
             left = float(np.sum((tau - factor * predicted) ** 2) / np.sum((tau - predicted) ** 2))

@@ -12,8 +12,7 @@ from robotid.base.typing import Array
 from robotid.diagnosis.decisions import CORRELATED, connected
 from robotid.estimation.fitting.fitted import Fit, Identified
 
-#: Columns of a row: link or drive, parameter, the URDF's value, the identified one, its standard
-#: error, its 95 % interval, what determined it, unit.
+#: Columns of a row; low and high are the ends of the 95 % interval, source what determined it.
 HEADERS = ("part", "parameter", "urdf", "value", "std_error", "low", "high", "source", "unit")
 _NUMBERS = HEADERS[2:7]
 #: Mass [kg], centre of mass [m], inertia about it [kg m^2], in the axes of the joint frame.
@@ -27,8 +26,7 @@ def parameter_entries(fit: Identified) -> tuple[list[dict[str, Any]], list[dict[
     """Return the parameters of the bodies and of the drives, as in result.json."""
     layout, sources, at_bound = fit.model.layout, fit.sources, fit.at_bound
     errors, ends, quantile = fit.standard_error, fit.standard_interval, fit.standard_quantile
-    pairs = correlated_parameters(fit)
-    entries = [
+    entries: list[dict[str, Any]] = [
         {
             "name": name,
             "value": float(fit.standard[i]),
@@ -39,14 +37,11 @@ def parameter_entries(fit: Identified) -> tuple[list[dict[str, Any]], list[dict[
             "prior": float(fit.prior[i]),
             "source": sources[i],
             "at_bound": bool(at_bound[i]),
-            **(
-                {"correlated_with": layout.names[pairs[i][0]], "correlation": pairs[i][1]}
-                if i in pairs
-                else {}
-            ),
         }
         for i, name in enumerate(layout.names)
     ]
+    for i, (k, r) in correlated_parameters(fit).items():
+        entries[i] |= {"correlated_with": layout.names[k], "correlation": r}
     return entries[: layout.n_inertial], entries[layout.n_inertial :]
 
 
@@ -106,10 +101,7 @@ class CentralParameters:
 
 
 def central_parameters(fit: Fit) -> CentralParameters:
-    """Return the parameters of each body about its centre of mass.
-
-    Standard errors are those of the standard parameters, propagated to first order.
-    """
+    """Return the parameters of each body about its centre of mass."""
     n, size = len(fit.model.layout.bodies), fit.model.layout.n_inertial
     pi, before = (x[:size].reshape(n, 10) for x in (fit.standard, fit.prior))
     error = fit.standard_error[:size]
@@ -126,10 +118,8 @@ def central_parameters(fit: Fit) -> CentralParameters:
 
 
 def _central(pi: Array) -> tuple[Array, Array]:
-    """Return m, c and I_c in Pinocchio's order, shape (10,), and their derivatives, (10, 10).
-
-    c = h / m and I_c = I - m (c c 1 - c c'), with the first moments h.
-    """
+    """Return m, c and I_c in Pinocchio's order, shape (10,), and their derivatives, (10, 10)."""
+    # c = h / m and I_c = I - m (c c 1 - c c'), with the first moments h.
     m, G = float(pi[0]), np.eye(10)
     if not m > 0:
         return np.append(m, np.full(9, np.nan)), G

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -26,8 +26,9 @@ _POSES = 300  # at which gravity is compared
 _LOADED = 0.02  # share of the largest gravity torque above which a joint is compared
 _HELD_BACK = 1.5  # residual over that of WLS beyond which the prior determines the result
 _ANOTHER = 0.35  # difference of gravity and total mass from which on they contradict the scale
-_CLEARLY = 4.0  # distance of a common factor from 1 over the share of gravity that it leaves, ...
-_BETTER = 0.5  # ... and the largest ratio of that share to the one that a payload leaves
+# Distance of a common factor from 1 over the share of gravity that it leaves, and largest ratio of
+# that share to the one that a payload leaves.
+_CLEARLY, _BETTER = 4.0, 0.5
 _TOTAL = "total mass"
 _ABSORBS = 0.1  # share of a change of a stated mass that a link takes up to be named
 
@@ -59,8 +60,7 @@ class KnownMass(ABC):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures as result.json has them."""
-        figures = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
-        return {key: list(x) if isinstance(x, tuple) else x for key, x in figures.items()}
+        return {key: list(x) if isinstance(x, tuple) else x for key, x in vars(self).items()}
 
     @classmethod
     def from_dict(cls, stated: Mapping[str, Any]) -> Self:
@@ -75,9 +75,7 @@ class StatedMass(KnownMass):
     """Masses that the user states, and what torque alone determines of them."""
 
     names: tuple[str, ...]  # "total_mass", or "mass of" a link
-    #: Mass that torque alone determines, without this statement and without the URDF's masses, over
-    #: the stated mass [-]; None if torque does not determine it.
-    ratio: float | None = None
+    ratio: float | None = None  # mass that torque alone determines, over the stated one [-]
     half_width: float = 0.0  # of its 95 % interval, plus that of the stated range [-]
     absorbed_by: tuple[str, ...] = ()  # links that take up the mass while no torque changes
     kind: ClassVar[str] = "stated mass"
@@ -162,20 +160,15 @@ class ScaleCheck:
     masses: tuple[float, float, float] = (0.0, 0.0, 0.0)
     stated: StatedMass | None = None
     payloads: tuple[PayloadCheck, ...] = ()  # that with the narrowest interval first
-    #: Whether torque alone determines the total mass within 5 %, so that a measured one verifies
-    #: the scale.
-    is_total_determined: bool = False
+    is_total_determined: bool = (
+        False  # within 5 % by torque alone: a measured one verifies the scale
+    )
     friction: Mapping[str, float] = field(default_factory=dict)  # its share of each torque [-]
-    #: Whether the result fits the data about as well as WLS. A result that its prior determines
-    #: agrees with the URDF whatever the sensors measured.
-    follows: bool = True
-    #: Factor common to the ratios of the joints, and half the width of its 95 % interval [-], as
-    #: errors of the URDF spread the ratios; None with fewer than two.
+    follows: bool = True  # the data, about as well as WLS, and not the prior
+    #: Factor common to the joints' ratios and its 95 % half-width [-]; None with fewer than two.
     common: tuple[float, float] | None = None
     mass_error: float = 0.0  # standard error of the identified total mass [kg]
-    #: Number of links whose inertials are assumed, so that gravity and mass of the URDF are no
-    #: evidence.
-    assumed: int = 0
+    assumed: int = 0  # number of links with assumed inertials: the URDF is no evidence
 
     @property
     def agrees(self) -> bool:
@@ -186,17 +179,14 @@ class ScaleCheck:
 
     @property
     def contradicts(self) -> bool:
-        """Whether a known mass, or else gravity and total mass of the URDF, contradict it.
-
-        A difference that errors of the URDF's links explain contradicts nothing, nor does a total
-        mass whose interval includes that of the URDF.
-        """
+        """Whether a known mass, or else gravity and total mass of the URDF, contradict it."""
+        # Errors of the URDF's links may explain it, or the interval of a total mass contain it.
         if self._decisive:
             return any(check.contradicts for check in self._decisive)
-        before, after, payload = self.masses
-        has_mass = abs(after - before) > QUANTILE * self.mass_error
         if self.has_one_factor:
             return True
+        before, after, payload = self.masses
+        has_mass = abs(after - before) > QUANTILE * self.mass_error
         if self._is_urdf:  # gravity is no evidence, a total mass that is determined is
             least = min(abs(after - before), abs(after - payload - before))
             return has_mass and not self._is_total_open and least > _ANOTHER * before
@@ -304,10 +294,8 @@ class ScaleCheck:
         return ({} if self.scale is None else {"gravity torque": self.factor}) | mass
 
     def _off(self, *, has_mass: bool = True) -> float:
-        """Return the difference of gravity and total mass, less a payload if it explains it [-].
-
-        A payload without mass is ignored: it does not determine the scale.
-        """
+        """Return the difference of gravity and total mass, less a payload if it explains it [-]."""
+        # A payload without mass is ignored: it does not determine the scale.
         before, after, payload = self.masses
         whole = self._off_whole(has_mass=has_mass)
         if not (before > 0 and payload > 0):
@@ -324,24 +312,19 @@ class ScaleCheck:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures as result.json has them."""
-        nested = {
-            "common": self.common and list(self.common),
-            "stated": self.stated and self.stated.to_dict(),
-            "payloads": [x.to_dict() for x in self.payloads],
-        }
         figures = {k: list(x) if isinstance(x, tuple) else x for k, x in vars(self).items()}
-        figures = {key: x for key, x in figures.items() if key not in nested}
-        figures |= {key: x for key, x in nested.items() if x} | {"is_stated": bool(self.stated)}
-        return figures | {"agrees": self.agrees, "message": self.message}
+        figures["stated"] = self.stated and self.stated.to_dict()
+        figures["payloads"] = [x.to_dict() for x in self.payloads]
+        optional = ("common", "stated", "payloads")
+        figures = {key: x for key, x in figures.items() if x or key not in optional}
+        return figures | {
+            "is_stated": bool(self.stated), "agrees": self.agrees, "message": self.message,
+        }  # fmt: skip
 
 
 def check_scale(fit: Fit) -> ScaleCheck:
-    """Compare gravity and masses of a result with the URDF's.
-
-    With g_u and g the gravity torques of the URDF and of the result over the fitted poses, a
-    joint's ratio is g_u . g / g_u . g_u. It is linear in the base parameters: the covariance of the
-    result gives its standard error.
-    """
+    """Compare gravity and masses of a result with the URDF's."""
+    # A joint's ratio is g_u . g / g_u . g_u, with gravity torques g_u of the URDF, g of the result.
     model, size = fit.model, fit.model.layout.n_inertial
     before, after = (float(pi[:size:10].sum()) for pi in (fit.prior, fit.standard))
     errors = [fit.metrics(name).per_joint for name in ("estimate", "wls")]
@@ -404,14 +387,10 @@ def check_scale(fit: Fit) -> ScaleCheck:
 
 
 def common_factor(ratios: Array, sensitivity: Array, inertial: Array) -> tuple[float, float]:
-    """Return the factor common to the gravity torques of joints, and its 95 % half-width [-].
-
-    A scale s of all torques and relative errors of the URDF's links give ratios r = s (1 + E e):
-    e are errors of mass and of the centre of mass, over the link's radius of gyration; independent,
-    of one unknown standard deviation. Generalised least squares with the covariance E E^T gives s;
-    the residual gives the deviation, Student's t with one degree of freedom less than joints the
-    interval. Errors of the data spread the ratios, too, and are included so.
-    """
+    """Return the factor common to the gravity torques of joints, and its 95 % half-width [-]."""
+    # Ratios r = s (1 + E e), with independent errors e of mass and of the centre of mass over the
+    # radius of gyration, of one unknown deviation: generalised least squares with E E^T, Student's
+    # t with one degree of freedom less than joints. Errors of the data spread the ratios, too.
     A, pi = sensitivity.reshape(len(ratios), -1, 10), inertial.reshape(-1, 10)
     second = np.trace(pseudo_inertia(inertial)[:, :3, :3], axis1=1, axis2=2)
     # mass times radius of gyration
@@ -439,10 +418,8 @@ def friction_shares(fit: Fit) -> dict[str, float]:
 
 
 def stated_mass(fit: Fit) -> StatedMass | None:
-    """Return the check of the masses that the user states; None without one.
-
-    A range wider than +- 5 % is a bound, not a statement. So is the mass of a pinned link.
-    """
+    """Return the check of the masses that the user states; None without one."""
+    # A range wider than +- 5 % is a bound, not a statement. So is the mass of a pinned link.
     layout, bounds = fit.model.layout, fit.estimator.bounds
     stated = {f"mass of {link}": (link, pair) for link, pair in bounds.masses.items()}
     if bounds.total is not None:
@@ -461,9 +438,10 @@ def stated_mass(fit: Fit) -> StatedMass | None:
 def determines_total_mass(fit: Fit) -> bool:
     """Return whether torque alone determines the total mass within 5 %."""
     masses = _are_masses(fit).astype(float)
-    if not masses @ fit.standard > 0:
+    total = float(masses @ fit.standard)
+    if not total > 0:
         return False
-    check = _checked(fit, ["total_mass"], masses[None] / (masses @ fit.standard), np.zeros(1))
+    check = _checked(fit, ["total_mass"], masses[None] / total, np.zeros(1))
     return check.ratio is not None and check.half_width <= AGREES
 
 
@@ -473,11 +451,9 @@ def _are_masses(fit: Fit) -> Array:
 
 
 def _checked(fit: Fit, names: Sequence[str], C: Array, widths: Array) -> StatedMass:
-    """Return what torque alone determines of the ratio r in C pi = r 1.
-
-    Torque alone determines K pi = beta. Sums Z^T C of the claims that are sums M K of base
-    parameters have no free part; with o = Z^T 1, r = o . M beta / o . o. In units of the spread.
-    """
+    """Return what torque alone determines of the ratio r in C pi = r 1."""
+    # Torque determines K pi = beta. Sums Z^T C of the claims that are sums M K have no free part;
+    # with o = Z^T 1, r = o . M beta / o . o. In units of the spread.
     model, wls = fit.model, fit.wls
     is_pinned = model.layout.owned_by(fit.estimator.bounds.pinned)
     spread = np.where(fit.prior_std > 0, fit.prior_std, model.layout.scales(model.length))

@@ -2,54 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+import difflib
+import math
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
-from robotid.base.findings import listed, quoted
-from robotid.diagnosis.catalogue import sentence_of
-from robotid.estimation.fitting.evaluation import JointMetrics, Metrics
-
-if TYPE_CHECKING:
-    from robotid.diagnosis.verdict.scale_check import ScaleCheck
-
-import difflib
-import math
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, replace
-from typing import Any
-
 from robotid.base.exceptions import SettingsError
-from robotid.base.findings import Finding, not_ignored
+from robotid.base.findings import Finding, listed, not_ignored, quoted
 from robotid.base.settings import require_kind
-from robotid.diagnosis.catalogue import codes_with, reason_of
+from robotid.diagnosis.catalogue import codes_with, reason_of, sentence_of
 from robotid.diagnosis.verdict.scale_check import ScaleCheck
-from robotid.estimation.fitting.evaluation import logs_that_test
+from robotid.estimation.fitting.evaluation import JointMetrics, Metrics, logs_that_test
 
-#: [%] largest torque prediction error on validation logs of a joint that is "good".
-GOOD = 15.0
-#: [%] a joint with a larger torque prediction error is not usable.
-POOR = 50.0
-#: [%] the same limits of simulated position errors.
-GOOD_POSITION, POOR_POSITION = 5.0, 30.0
+GOOD = 15.0  # [%] largest torque prediction error on validation logs of a joint that is "good"
+POOR = 50.0  # [%] a joint with a larger torque prediction error is not usable
+GOOD_POSITION, POOR_POSITION = 5.0, 30.0  # [%] the same limits of simulated position errors
 #: Error over that of the second-order model from which it is hardly smaller: half the squares.
 HARDLY = 0.7
-#: A simpler model is better if its error is smaller by this factor ...
-BEATEN = 1.05
+BEATEN = 1.05  # A simpler model is better if its error is smaller by this factor ...
 _TIE = 0.3  # [%] ... and, for the URDF with fitted drives, by this share of the torque
-#: [%] a larger error on the fitted logs, twice that of WLS, makes a joint poor.
-COSTLY = 3.0
+COSTLY = 3.0  # [%] a larger error on the fitted logs, twice that of WLS, makes a joint poor
 #: [%] of the torque: a smaller prediction error rejects a hypothesis on columns or masses, and
 #: gives no warning of a missing drive term.
 SMALL = 5.0
 _HARMLESS = 1.0  # [%] of the torque, below which an error gives no warning
 _MUCH = 2.0  # ratio of two errors, or of two gravity torques, that is no chance
 _BASE = "base."  # of the rows of a floating base
-#: Parameters, joints or places that a sentence names.
-NAMED = 8
+NAMED = 8  # Parameters, joints or places that a sentence names
 _NOT_VERIFIED = "not verified, no validation log"
 _UNSCALED = "torque scale not verified"
 _HYPOTHESES = ("current_for_torque", "gravity", "gravity_compensated", "unexplained_torque",
@@ -124,15 +107,14 @@ class Predictions:
         """Return why no prediction of unseen motion was evaluated; empty if one was."""
         if self.validation:
             return []
-        what = "refitted" if self.refitted else "none"
-        return [sentence_of("verdict:untested", what=what, logs=listed(self.refitted))]
+        logs = listed(self.refitted)
+        return [sentence_of("verdict:untested", what=bool(self.refitted), logs=logs)]
 
     def better_by_urdf(self, rescaled: Collection[str] = ()) -> list[str]:
         """Return the joints that the URDF with fitted drives predicts better, and the remedy."""
-        worse = [j for own in self.tested.values() for j, m in own.items() if is_beaten(m)]
-        worse = [joint for joint in worse if joint not in rescaled]
-        joints = listed(dict.fromkeys(worse))
-        return [sentence_of("verdict:urdf", joints=joints)] if worse else []
+        tested = (pair for metrics in self.tested.values() for pair in metrics.items())
+        worse = dict.fromkeys(j for j, m in tested if is_beaten(m) and j not in rescaled)
+        return [sentence_of("verdict:urdf", joints=listed(worse))] if worse else []
 
     def at_rest(self) -> list[str]:
         """Return the joints at rest in all recordings, and those at rest in all validation logs."""
@@ -151,11 +133,10 @@ class Predictions:
 
     def why_untested(self, joint: str) -> str:
         """Return why a joint was evaluated on no validation log."""
-        if joint not in self.fitted:
-            return "it does not move in any recording"
-        if self.validation:
-            return "it does not move in any validation log"
-        return "no validation log given"
+        if joint in self.fitted and not self.validation:
+            return "no validation log given"
+        logs = "validation log" if joint in self.fitted else "recording"
+        return f"it does not move in any {logs}"
 
 
 @dataclass(frozen=True)
@@ -175,15 +156,13 @@ class Determined:
     is_consistent: bool = True  # whether the parameters are physically consistent
     is_poorly_excited: bool = True  # whether a richer motion would determine them; else noise
     is_static: bool = False
-    #: Other drive parameters whose standard error is not smaller than 0.9 of their prior standard
-    #: deviation.
-    uncertain_drives: Sequence[str] = ()
+    uncertain_drives: Sequence[str] = ()  # standard error from 0.9 of the prior's deviation
 
     def warnings(self) -> list[str]:
         """Return the reasons why the result is at best usable."""
         is_open = bool(self.undetermined) and self.is_poorly_excited
-        holds = {"open": is_open, "inconsistent": not self.is_consistent}
-        return [self._sentence(what, self.undetermined) for what, is_so in holds.items() if is_so]
+        reasons = [self._sentence("open", self.undetermined)] if is_open else []
+        return reasons if self.is_consistent else [*reasons, self._sentence("inconsistent", ())]
 
     def notes(self) -> list[str]:
         """Return notes that do not change the verdict: parameters hidden by the noise."""
@@ -242,8 +221,7 @@ def _judge_joint(
     constant = error / np.sqrt(1.0 - measured.r2) if what == "constant" else 0.0
     text = sentence_of(
         "verdict:joint", what=what, subject_of=joint, on=log, error=error, urdf=urdf, fit=before,
-        quoted=quoted(joint), driven=driven, constant=constant,
-        poor=POOR, good=GOOD,
+        quoted=quoted(joint), driven=driven, constant=constant, poor=POOR, good=GOOD,
     )  # fmt: skip
     if rank is None:
         evidence.cautions.append(text)
@@ -259,16 +237,10 @@ def uses_of_torques(
     log_errors: Sequence[str],
     scale_check: ScaleCheck | None,
 ) -> dict[str, str]:
-    """Return what a result with predicted torques can be used for: "yes" or "no", and why.
-
-    Torque feed-forward needs the predicted torque of its joints. Inertials in a simulation need
-    physical consistency and the torque scale, too. The mass of a payload is that of the gravity
-    torque: it needs the joints that gravity loads, and the torque scale.
-    """
-    predicted = _predicted(joints)
-    loaded = (
-        {} if scale_check is None else {j: s for j, s in joints.items() if j in scale_check.gravity}
-    )
+    """Return what a result with predicted torques can be used for: "yes" or "no", and why."""
+    # Inertials need consistency and the scale; a payload joints that gravity loads, and the scale.
+    predicted, gravity = _predicted(joints), () if scale_check is None else scale_check.gravity
+    loaded = {joint: status for joint, status in joints.items() if joint in gravity}
     if log_errors:
         predicted = inertials = payload = "no, errors of the recordings"
     elif scale_check is not None and scale_check.contradicts:
@@ -285,11 +257,8 @@ def uses_of_torques(
     if is_static:
         predicted = _with(predicted, "at rest and in slow motion")
         inertials = "no, inertias are the URDF's" if inertials.startswith("yes") else inertials
-    return {
-        "torque feed-forward": predicted,
-        "inertials in simulation": inertials,
-        "payload estimation": payload,
-    }
+    uses = ("torque feed-forward", "inertials in simulation", "payload estimation")
+    return dict(zip(uses, (predicted, inertials, payload), strict=True))
 
 
 def uses_of_motion(
@@ -395,7 +364,6 @@ def judge(
         evidence[warning.joint].poor.extend((2, text) for text in _described([warning]))
     stated, warnings = warnings, [warning for warning in warnings if warning not in costly]
     largest = sorted(evidence.values(), key=lambda one: -max(one.errors, default=0.0))
-    poor = _ranked(reason for one in largest for reason in one.poor)
     is_contradicted = scale_check is not None and scale_check.contradicts
     scale = [] if scale_check is None else [scale_check.message]
     reasons = [
@@ -436,6 +404,7 @@ def judge(
         f"{worst:.1f} % at every joint, smaller than that of a constant and that of the URDF; all "
         "parameters are physically consistent"
     )
+    poor = _ranked(reason for one in largest for reason in one.poor)
     verdict = concluded(
         per_joint, poor=poor, warnings=reasons, good=good, notes=notes, log_errors=log_errors
     )
@@ -525,19 +494,14 @@ def blocking(
 def rejected(
     findings: Sequence[Finding], validation: Mapping[str, Metrics], scale_check: ScaleCheck
 ) -> list[Finding]:
-    """Return findings; hypotheses that a good prediction of unseen motion rejects become notes.
-
-    Wrong masses, a wrong direction of gravity or an unexplained torque are rejected if the error of
-    these torques is below 5 % on every validation log. Another unit of the torque, or a torque
-    without gravity, is rejected if the identified gravity torque is also within a factor of two
-    of the URDF's.
-    """
+    """Return findings; hypotheses that a good prediction of unseen motion rejects become notes."""
+    # If the error of these torques is below 5 % on every validation log. Another unit, or a torque
+    # without gravity, also needs an identified gravity torque within a factor of two of the URDF's.
     errors: dict[str, float] = {}
-    for metrics in validation.values():
+    is_fitted = any(one.code == "repeated_motion" for one in findings)
+    for metrics in () if is_fitted else validation.values():
         for joint, measured in metrics.per_joint.items():
             errors[joint] = max(errors.get(joint, 0.0), error_of(measured))
-    if any(one.code == "repeated_motion" for one in findings):
-        errors = {}  # the motion was fitted
     kept = []
     for one in findings:
         joints = [joint for joint in one.joints if joint in errors] or [*errors]
@@ -578,10 +542,9 @@ def warnings_of(
         is_jump = one.code == "unexplained_torque" and (one.log, one.joints) in jumps
         if not is_jump and not _is_harmless(one):
             warnings += _warnings(one, joints)
-    repeated = {f.code: f for f in findings if f.code == "repeated_motion"}
-    logs = {f.where for f in findings if f.code == "repeated_motion"}
-    if validation and logs.issuperset(validation):
-        warnings += [VerdictWarning(code, "", reason_of(f)) for code, f in repeated.items()]
+    repeated = {f.where: f for f in findings if f.code == "repeated_motion"}
+    if validation and repeated.keys() >= set(validation):
+        warnings += [VerdictWarning(f.code, "", reason_of(f)) for f in repeated.values()]
     return tuple(dict.fromkeys(warnings))
 
 
@@ -617,11 +580,10 @@ def _warnings(finding: Finding, joints: Sequence[str]) -> Iterator[VerdictWarnin
 
 def _is_harmless(finding: Finding) -> bool:
     """Return whether the torque error is small in spite of a constraint or a missing term."""
-    if finding.code in codes_with("term"):
-        return finding.evidence["error_pct"] < SMALL and "replaces" not in finding.evidence
-    if finding.code != "constraint_costs":
-        return False
-    return is_harmless_cost(finding.evidence["error_pct"], finding.evidence["wls_error_pct"])
+    figures, is_term = finding.evidence, finding.code in codes_with("term")
+    if is_term or finding.code != "constraint_costs":
+        return is_term and figures["error_pct"] < SMALL and "replaces" not in figures
+    return is_harmless_cost(figures["error_pct"], figures["wls_error_pct"])
 
 
 def judge_positions(
@@ -642,19 +604,16 @@ def judge_positions(
         j: _judge_position(j, measured.get(j), of_fit.get(j), is_validation) for j in joints
     }
     errors = {joint: error_of(m) for joint, m in measured.items()}
-    worst_first = sorted(verdicts, key=lambda joint: -errors.get(joint, 0.0))
-
-    def reasons(status: str) -> list[str]:
-        stated = (verdicts[joint] for joint in worst_first)
-        return [why for verdict in stated if verdict.status == status for why in verdict.reasons]
-
+    reasons: dict[str, list[str]] = {status: [] for status in ("poor", "not evaluated", "usable")}
+    for joint in sorted(verdicts, key=lambda joint: -errors.get(joint, 0.0)):  # the worst first
+        reasons.setdefault(verdicts[joint].status, []).extend(verdicts[joint].reasons)
     unseen = "prediction of unseen motion not evaluated: no validation log given"
     warnings = [*cautions, *([] if is_validation else [unseen])]
     warnings += [] if is_settled else ["the fit has not converged"]
     verdict = concluded(
         verdicts,
-        poor=reasons("poor"),
-        warnings=[*warnings, *reasons("not evaluated"), *reasons("usable")],
+        poor=reasons["poor"],
+        warnings=[*warnings, *reasons["not evaluated"], *reasons["usable"]],
         good="simulated position error on validation logs: at most "
         f"{max(errors.values(), default=0.0):.2g} % of each joint's RMS motion, smaller than those "
         "of simpler models",

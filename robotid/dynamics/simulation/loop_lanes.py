@@ -1,9 +1,8 @@
 """Closed-loop simulation of a robot with sensitivities, in Numba: the steps and the drives' laws.
 
-Imported only for closed-loop simulations. ``LANES`` windows of logs are simulated together, one in
-each lane of the work space of ``tree_lanes``, each from the initial state of its window.
-
-One step solves for the speed u at the instant t + theta dt
+``LANES`` windows of logs are simulated together, one in each lane of the work space of
+``tree_lanes``, each from the initial state of its window. One step solves for the speed u at the
+instant t + theta dt
 
     D (u - v) / (theta dt) + h(q', v) + f(q', u) = kp (r - q - theta dt u) + kd (w - u) + ff,
 
@@ -16,15 +15,10 @@ Torques of gravity and speeds are exact to first order. ``corrects`` solves each
 with M and h at the midpoint q + theta dt u of the first solution: exact to second order, except
 where friction reverses within the step. Such roll-outs have no sensitivities.
 
-Presliding friction x z has the bristle deflection z as a further state. Over a step, at the speed
-u, its equation is linear and solved exactly. The torque is that of z at t + theta dt.
-
-A discrete-time controller samples q, v and its commands at its ticks, and has a zero-order hold of
-the torque. No step crosses a tick. The held torque has its own sensitivities, which change only at
-ticks.
-
-Friction has the laws of the terms of ``drives``, compiled one by one; the code here calls a law by
-its address. ``drive`` has armature, kp, kd and torque limit.
+The bristle deflection z of presliding friction x z is a further state; over a step its equation is
+linear and solved exactly. The torque is that of z at t + theta dt. A discrete-time controller
+samples q, v and commands at its ticks, which no step crosses, with a zero-order hold of the torque.
+Friction has the laws of ``drives``, compiled one by one and called by address.
 """
 
 import math
@@ -141,61 +135,38 @@ class Places(NamedTuple):
     middle: int  # position at that instant
     h: int  # torque of gravity and speeds
     a: int  # acceleration
-    M: int  # mass matrix of the bodies, (n, n)
     G: int  # residual of the step's equation, then the correction of u
-    H: int  # derivative of G by u, then its factor, (n, n)
     by_q: int  # derivative of friction by the position
     gains: int  # 1 for a loop below its torque limit, else 0
     load: int  # torque of the bodies
     loss: int  # factor of the load in a gear with friction
+    own: int  # derivative of the equation by one parameter
+    change: int  # of u by one parameter
     held: int  # torque until the next tick; -1 in continuous time
     grip: int  # friction of bristles, then its derivative by the speed
-    bristles: int  # of each: z, the acting z, and three derivatives
+    M: int  # mass matrix of the bodies, (n, n)
+    H: int  # derivative of G by u, then its factor, (n, n)
     T_q: int  # derivative of the equation by positions before the step, (n, n)
     T_v: int  # and by speeds, (n, n)
     S: int  # sensitivities of positions and speeds, (2n, P)
-    own: int  # derivative of the equation by one parameter
-    change: int  # of u by one parameter
     by_hold: int  # sensitivities of the held torques, (n, P)
+    bristles: int  # of each: z, the acting z, and three derivatives
     by_state: int  # sensitivities of the bristles, (bristles, P)
+    end: int
 
 
-@compiled
-def _places(n, P, n_bristles, is_held):
-    q = (n + 1) * BODY
-    M = q + 13 * n
-    S = M + 4 * n * n
-    held = S + 3 * n * P
-    grip = held + n
-    bristles = grip + 2 * n
-    return Places(
-        n, P, q, q + n, q + 2 * n, q + 3 * n, q + 4 * n, q + 5 * n,
-        M, q + 6 * n, M + n * n, q + 7 * n, q + 8 * n, q + 11 * n, q + 12 * n,
-        held if is_held else -1, grip, bristles,
-        M + 2 * n * n, M + 3 * n * n, S, q + 9 * n, q + 10 * n,
-        S + 2 * n * P, bristles + 5 * n_bristles,
-    )  # fmt: skip
-
-
-def work_of(joints: int, columns: int, n_bristles: int) -> Array:
-    """Return a new work space for ``_places``."""
-    n = joints
-    own = (n + 1) * BODY + 4 * n * n + 16 * n + 3 * n * columns
-    return work_space(own + n_bristles * (5 + columns))
-
-
-def last_step(work: Array, joints: int) -> tuple[Array, Array]:
-    """Return the positions before the last step and its last correction of speeds, (n, LANES)."""
-    rows, q = work.reshape(-1, LANES), (joints + 1) * BODY
-    return rows[q : q + joints], rows[q + 6 * joints : q + 7 * joints]
+def places_of(n: int, P: int, n_bristles: int, is_held: bool) -> tuple[Places, Array]:
+    """Return the places of the quantities, one after the other, and a new work space of them."""
+    sizes = [n] * 14 + [2 * n] + [n * n] * 4 + [2 * n * P, n * P, 5 * n_bristles, n_bristles * P]
+    at = Places(n, P, *np.cumsum([(n + 1) * BODY, *sizes]).tolist())
+    return at if is_held else at._replace(held=-1), work_space(at.end)
 
 
 @compiled
 def _balance(work, at, robot, step, now):
     """Write the residual G of a step's equation for the speeds u, and its derivative H.
 
-    Row i is divided by e = 1 + mu s(u) sign(tau), the factor of the bodies' torque tau in a gear
-    with friction mu |tau|, so that H is symmetric.
+    Rows are divided by e = 1 + mu s(u) sign(tau) of gears with friction mu |tau|: H is symmetric.
     """
     n, drives, terms = at.n, robot.drives, robot.terms
     codes, shapes, values, spans, _ = terms
@@ -274,10 +245,7 @@ def _add_fall(work, at, terms):
 
 @compiled
 def _newton(work, at, robot, step, now, is_cautious):
-    """Iterate Newton's method for ``_solve``, without falling friction in H if cautious.
-
-    Friction is nonlinear at speed 0, so a Newton step that would cross it ends there.
-    """
+    """Iterate Newton's method for ``_solve``, without falling friction in H if cautious."""
     for k in range(_NEWTON):
         share = 1.0 if k < _NEWTON // 4 else 0.5  # against cycles of several joints' friction
         _balance(work, at, robot, step, now)
@@ -289,7 +257,7 @@ def _newton(work, at, robot, step, now, is_cautious):
         for i in range(at.n):
             before = get(work, at.u + i)
             after = before - share * get(work, at.G + i)
-            halts = after * before < 0.0
+            halts = after * before < 0.0  # at speed 0, where friction is nonlinear
             after = where(halts, 0.0, after)
             is_close = abs(after - before) <= _CLOSE * (1.0 + abs(after))
             is_found = is_found and not is_any(halts | ~is_close)
@@ -356,10 +324,7 @@ def _presliding(work, at, terms, span):
 
 @compiled
 def _advance_bristles(work, at, terms, span, step):
-    """Write z after a step, the acting z a time after its start, and derivatives of both.
-
-    The derivatives are: of the acting z by z before; of z after by the speed u, and by z before.
-    """
+    """Write z after a step, the z that acts, and d acting / d before, d after / d u, d before."""
     for slot in range(len(terms.bristles)):
         x, speed = terms.shapes[terms.bristles[slot, 0]], get(work, at.u + terms.bristles[slot, 1])
         z = at.bristles + 5 * slot
@@ -518,15 +483,13 @@ def _initialise(work, at, robot, columns, start, out_S):
 
 
 @compiled
-def roll_out(robot, columns, course, out, work, corrects):
+def roll_out(robot, columns, course, out, work, at, corrects):
     """Simulate a block of lanes; return the first step without a solution, or -1."""
     command, steps, ticks, every, start = course
     out_q, out_v = out.q.reshape(out.q.size), out.v.reshape(out.v.size)
     out_S, rows = out.S.reshape(out.S.size), out.S.shape[1]
     tree, bodies, terms = robot.tree, robot.bodies, robot.terms
-    n, P = len(tree.parents), len(columns.sums) - 1
-    at = _places(n, P, len(terms.bristles), len(ticks) > 0)
-    work[:] = 0.0
+    n, P = at.n, at.P
     _initialise(work, at, robot, columns, start, out.S)
     commands, starts = command.reshape(command.size), ticks.reshape(ticks.size)
     lengths = steps.reshape(steps.size)
@@ -568,8 +531,8 @@ def roll_out(robot, columns, course, out, work, corrects):
 def coded_term(term: DriveTerm) -> tuple[tuple[int, ...], tuple[float, ...]]:
     """Return a term for ``term`` and ``deflection``: five codes and eleven numbers.
 
-    The codes are the addresses of its laws of speed and position (0 without one), its kind, and the
-    counts of their shape parameters; the numbers four of these for each law, and the ranges.
+    Addresses of its laws of speed and position (or 0), kind, counts of shape parameters; numbers:
+    four of these for each law, and the ranges.
     """
     if isinstance(term, Bristles):
         return (0, 0, BRISTLES, 0, 0), (*term.numbers, *[0.0] * 8)
@@ -672,10 +635,7 @@ def deflection_by_lane(x, before, u, span):
 
 @compiled
 def initial_deflection(x, v, time):
-    """Return the deflection z of a drive that has moved for a time, and its derivative by speed.
-
-    It is that of steady sliding, unless the drive needs more time for its displacement.
-    """
+    """Return z after a time of motion, at most that of steady sliding, and its derivative by v."""
     g, g_v, _ = _bristles(x, 0.0, v)
     s, s_v = direction(v, x[0] / time)
     return s * g, s_v * g + s * g_v
@@ -746,10 +706,7 @@ def average_command(stamps, values, times, delay, mean, change):
 
 @compiled
 def divide_rows(stamps, ticks, times, is_tick):
-    """Write the ends of the steps: an equal number in each row, and none across a tick.
-
-    Ticks divide a row; the longest steps are divided further until the row has the number.
-    """
+    """Write the ends of the steps: an equal number in each row, none across a tick."""
     every, i = len(is_tick) // (len(stamps) - 1), 0
     edges, shares = np.empty(every + 1), np.empty(every, np.int64)
     is_tick[:], is_tick[0] = False, True
@@ -764,7 +721,7 @@ def divide_rows(stamps, ticks, times, is_tick):
             i += 1
         edges[count] = stamps[k + 1]
         shares[:count] = 1
-        for _ in range(every - count):
+        for _ in range(every - count):  # the longest step is divided further
             longest, length = 0, 0.0  # np.argmax and np.diff take three seconds to compile
             for j in range(count):
                 step = (edges[j + 1] - edges[j]) / shares[j]

@@ -1,15 +1,14 @@
 """Closed-loop simulation of windows of logs, with sensitivities.
 
-A robot with a fixed base consists of parts that only the base joins, such as the legs of a
-quadruped; each part is simulated independently. The lanes of the compiled code simulate several
-windows in parallel.
+Parts of a robot that only its fixed base joins, such as legs, are simulated independently. The
+lanes of the compiled code simulate several windows in parallel.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import islice, pairwise
+from itertools import chain, islice, pairwise
 from types import ModuleType
 from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeAlias
 
@@ -27,7 +26,7 @@ from robotid.robot.mass_matrix import rigid_mass_matrices
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
-    from robotid.dynamics.simulation.loop_lanes import Course
+    from robotid.dynamics.simulation.loop_lanes import Course, Terms
 
 #: Kind, joint and index of a parameter of the sensitivities; see ``loop_lanes``.
 Column: TypeAlias = tuple[int, int, int]
@@ -45,11 +44,10 @@ _FASTEST = 1e6  # speed above which a closed loop is unstable [rad/s or m/s]
 class Loops:
     """Parameters of bodies, drives and the drives' control loops.
 
-    torque = kp (q_ref - q) + kd (v_ref - v) + tau_ref, at most ``limit``, with commands delayed by
-    ``delay``; position 0 of a joint's encoder is position ``zero`` of the URDF. With a ``rate``,
-    the controller samples all signals at its ticks, with a zero-order hold of the torque. Ticks are
-    counted from the first row of a log. A command at a tick is averaged over the row after the
-    tick, so that a delay of part of a row interpolates between whole rows.
+    torque = kp (q_ref - q) + kd (v_ref - v) + tau_ref, at most ``limit``, of delayed commands;
+    position 0 of an encoder is position ``zero`` of the URDF. With a ``rate``, the controller
+    samples at its ticks, counted from the first row of a log, with a zero-order hold. A command at
+    a tick is averaged over the row after it: a delay of part of a row interpolates between rows.
     """
 
     bodies: Array  # ten inertial parameters of each body, shape (n, 10), in the order of the layout
@@ -110,7 +108,7 @@ class Window:
     def _near(self) -> slice:
         """The samples about the first one."""
         wide = max(_FEWEST, round(_AROUND / self.dt))
-        return slice(max(self.start_row - wide, 0), min(self.start_row + wide + 1, len(self.log.t)))
+        return slice(max(self.start_row - wide, 0), self.start_row + wide + 1)
 
     @cached_property
     def dt(self) -> float:
@@ -241,44 +239,34 @@ class ClosedLoopRobot:
         along: Array,
         outputs: int,
     ) -> tuple[Array, Array, Array, Array]:
-        """Return sensitivities, positions, speeds and derivatives of a part in a block of windows.
-
-        ``wanted`` has a row for each column: kind, joint, index, and index of the sensitivity.
-        """
+        """Return numbers, positions, speeds and derivatives; wanted: kind, joint, index, number."""
         lanes, own, n = _lanes(), part.joints, len(part.joints)
         columns = wanted[np.isin(wanted[:, 1], own)]
         numbers, first = np.unique(columns[:, 3], return_index=True)
         sums = np.append(first, len(columns)).astype(np.int64)
         columns = np.ascontiguousarray(columns[:, :3])
         columns[:, 1] = [np.flatnonzero(own == j)[0] for j in columns[:, 1]]
-        places, spans, affine = _arranged(loops, own)
+        places, terms, affine = _arranged(loops, own)
         is_term = columns[:, 0] == self.kinds["term"]
         columns[is_term, 2] = [np.flatnonzero(places == k)[0] for k in columns[is_term, 2]]
-        every_term = [(term, j) for j, terms in enumerate(loops.terms) for term in terms]
-        coded = [lanes.coded_term(every_term[k][0]) for k in places]
-        codes = np.array([code for code, _ in coded], dtype=np.int64).reshape(-1, 5)
-        shapes = np.array([numbers for _, numbers in coded]).reshape(-1, 11)
-        of_joint = np.array([np.flatnonzero(own == every_term[k][1])[0] for k in places], dtype=int)
-        states = np.flatnonzero(codes[:, 2] == BRISTLES)
-        bristles = np.column_stack([states, of_joint[states]])
-        terms = lanes.Terms(codes, shapes, loops.values[places], spans, bristles)
-        drives = np.column_stack(
-            [x[own] for x in (loops.armature, loops.kp, loops.kd, loops.limit)] + [affine]
-        )
+        gains = [x[own] for x in (loops.armature, loops.kp, loops.kd, loops.limit)]
+        drives = np.column_stack([*gains, affine])
         robot = lanes.Robot(part.tree, loops.zero[own], loops.bodies[part.bodies], drives, terms)
         course = self._course(part, windows, loops)
         samples = len(course.steps) // course.every + 1
         q, v = np.zeros((2, samples, n, lanes.LANES))
         S = np.zeros((samples, outputs * n, len(numbers), lanes.LANES))
         q[0], v[0] = course.start
-        work = lanes.work_of(n, len(numbers), len(states))
+        is_held = loops.rate is not None
+        at, work = lanes.places_of(n, len(numbers), len(terms.bristles), is_held)
         kinds, motion = lanes.Columns(columns, sums, along), lanes.Motion(q, v, S)
-        failed = lanes.roll_out(robot, kinds, course, motion, work, self.corrects)
+        failed = lanes.roll_out(robot, kinds, course, motion, work, at, self.corrects)
         if failed >= 0 or not (np.abs(v) < _FASTEST).all():
-            last = lanes.last_step(work, n) if failed >= 0 else None
-            at, lane, i, angles = _failed_at(failed // course.every, last, q, v)
+            rows = work.reshape(-1, lanes.LANES)
+            last = (rows[at.q : at.q + n], rows[at.G : at.G + n]) if failed >= 0 else None
+            row, lane, i, angles = _failed_at(failed // course.every, last, q, v)
             window = windows[lane]
-            time = float(window.log.t[min(window.start_row + at, window.stop - 1)])
+            time = float(window.log.t[min(window.start_row + row, window.stop - 1)])
             why = why_no_solution(self.model, loops, own, angles, i, self.step)
             raise NotConvergedError(why, f"{window.log.name} at {time:.4g} s")
         return numbers, q, v, S
@@ -372,13 +360,9 @@ def _parts(tree: Tree) -> list[_Part]:
     return [_Part(tree.leaders[own], own, tree.part(own)) for own in bodies]
 
 
-def _arranged(loops: Loops, joints: Array) -> tuple[Array, Array, Array]:
-    """Return the indices in ``loops.values`` of the terms of joints, joint by joint.
-
-    Also, for each joint, the index of its first term, and of its first bristle or affine term,
-    (n, 2); and the sums of its affine terms: constant, by the speed, by its direction, (n, 3).
-    """
-    first = np.cumsum([0, *map(len, loops.terms)])
+def _arranged(loops: Loops, joints: Array) -> tuple[Array, "Terms", Array]:
+    """Return indices in ``loops.values`` of joints' terms, these, sums of affine ones (n, 3)."""
+    lanes, first = _lanes(), np.cumsum([0, *map(len, loops.terms)])
     places, spans, affine = list[int](), [], np.zeros((len(joints), 3))
     for i, j in enumerate(joints):
         others, rest = list[int](), list[int]()
@@ -390,7 +374,15 @@ def _arranged(loops: Loops, joints: Array) -> tuple[Array, Array, Array]:
                 (rest if isinstance(term, Bristles) else others).append(k)
         spans.append([len(places), len(places) + len(others)])
         places += [*others, *rest]
-    return np.array(places, dtype=int), np.array(spans, dtype=np.int64), affine
+    terms = list(chain.from_iterable(loops.terms))
+    coded = [lanes.coded_term(terms[k]) for k in places]
+    codes = np.array([code for code, _ in coded], dtype=np.int64).reshape(-1, 5)
+    shapes = np.array([numbers for _, numbers in coded]).reshape(-1, 11)
+    states = np.flatnonzero(codes[:, 2] == BRISTLES)
+    of_joint = np.searchsorted([start for start, _ in spans], states, side="right") - 1
+    order, edges = np.array(places, dtype=int), np.array(spans, dtype=np.int64)
+    bristles = np.column_stack([states, of_joint])
+    return order, lanes.Terms(codes, shapes, loops.values[order], edges, bristles), affine
 
 
 def _lanes() -> ModuleType:
@@ -403,10 +395,7 @@ def _lanes() -> ModuleType:
 def _failed_at(
     row: int, last: tuple[Array, Array] | None, q: Array, v: Array
 ) -> tuple[int, int, int, Array]:
-    """Return row, lane and joint of a failed roll-out, and the positions in this lane, shape (n,).
-
-    The positions of an unstable one are the initial ones: q and v (N, n, LANES).
-    """
+    """Return row, lane and joint of a failed roll-out, and positions (n,); unstable: initial."""
     if last is None:
         is_fast = ~(np.abs(v) < _FASTEST)
         row, i, lane = (int(k) for k in np.unravel_index(np.argmax(is_fast), v.shape))
@@ -426,7 +415,10 @@ def why_no_solution(
         return _slow_rate(loops, loops.rate, [model.joints[j] for j in joints], joints, M)
     for j, angle in zip(joints, q, strict=True):
         if why := _wrong_friction(model, loops, j, angle):
-            return why
+            return (
+                f"the simulation of {model.joints[j]} has no solution: {why}. Set other friction "
+                f"terms of {model.joints[j]} in [drives]"
+            )
     name, kp, inertia = model.joints[joints[last]], float(loops.kp[joints[last]]), M[last, last]
     return (
         f"the simulation of {name} has no solution in steps of {step:g} s: its gain kp is {kp:.3g} "
@@ -438,24 +430,18 @@ def why_no_solution(
 
 def _wrong_friction(model: RobotModel, loops: Loops, j: int, angle: float) -> str:
     """Return which friction of a joint makes its motion impossible or ambiguous; else ""."""
-    name = model.joints[j]
     for term in loops.terms[j]:
         value = float(loops.values[loops.place(j, term)])
         is_negative = term.is_nonnegative and value < 0.0
         if is_negative or value > term.highest:
             wanted = "0 or more" if is_negative else f"at most {term.highest:g}"
-            return (
-                f"the simulation of {name} has no solution: {name}.{term.name} is {value:.3g}, "
-                f"wanted {wanted}. Set other friction terms of {name} in [drives]"
-            )
+            return f"{model.joints[j]}.{term.name} is {value:.3g}, wanted {wanted}"
     at_rest = float(friction_at_rest(loops, j, np.array([angle]))[0])
     if at_rest >= 0.0:
         return ""
     unit, force = ("m", "N") if model.limits[j].type == "prismatic" else ("rad", "N m")
-    return (
-        f"the simulation of {name} has no solution: its Coulomb friction is {at_rest:.3g} {force} "
-        f"at {angle:.3g} {unit}, wanted 0 or more. Set other friction terms of {name} in [drives]"
-    )
+    stated = f"{at_rest:.3g} {force} at {angle:.3g} {unit}"
+    return f"its Coulomb friction is {stated}, wanted 0 or more"
 
 
 def friction_at_rest(loops: Loops, j: int, q: Array) -> Array:

@@ -5,7 +5,7 @@ from abc import abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from statistics import NormalDist
-from typing import ClassVar, Generic, Literal, TypeAlias, TypeVar
+from typing import ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
 from scipy.linalg.lapack import dtpqrt
@@ -26,23 +26,17 @@ from robotid.estimation.estimators.estimator import (
 )
 
 StateT = TypeVar("StateT")
-#: Rows of a sample: all, or the indices of the rows of positive weight.
-Rows: TypeAlias = slice | Array
 
 _BLOCK = 8  # block size of LAPACK
 _PATIENCE = 50  # largest number of successive rows of a joint that the gate rejects
 _AVERAGE = 3.0  # weight of the newest iterate: 3 / (k + 2), the initial value decays as k^-3
 _MEMORY = 1000.0  # [samples] over which PRX and the residuals are averaged
-_SMALLEST = 1e-6  # lower bound of the eigenvalues of D(q, P^), relative to the largest
 _NO_PRX = 1e-9  # norm of the moving average of PRX below which it is 0, scaled parameters
 _GAIN = 0.01  # relative decrease of the squared residual per pass at convergence
 
 
 class RecursiveEstimator(Estimator[Problem], Generic[StateT]):
-    """Interface of recursive estimators: settings in the constructor, results in a state.
-
-    A state is an immutable dataclass of arrays and numbers.
-    """
+    """Interface of recursive estimators: settings in the constructor, an immutable state."""
 
     reads: ClassVar[Literal["samples"]] = "samples"
 
@@ -119,19 +113,16 @@ class RLSState:
 
 @dataclass(frozen=True, eq=False)
 class RLS(Filter[RLSState]):
-    """Recursive least squares with exponential forgetting.
-
-    The state is the triangular factor R of all rows. It is updated with a sample by QR:
+    """Recursive least squares with exponential forgetting: the triangular factor R of all rows.
 
         R <- triangle of [sqrt(forgetting) R; [Y tau] / sigma].
 
-    Nothing is inverted until an estimate is computed, so the update is numerically stable, and the
-    initial state has no information: without forgetting the result is that of batch least squares.
-    With forgetting, information that is not updated by motion would vanish (wind-up). Each step
-    therefore adds one row of the prior, one parameter after the other, so that the prior
-    information of each stays between forgetting^c and 1 times that of the prior. Parameters that
-    are not identifiable have infinite variance. Bierman (1977), Factorization Methods for Discrete
-    Sequential Estimation, chapter IV.
+    Nothing is inverted until an estimate is computed, and the initial state has no information:
+    without forgetting the result is that of batch least squares. With forgetting, information that
+    motion does not update would vanish (wind-up): each step adds one row of the prior, one
+    parameter after the other, so that the prior information of each stays between forgetting^c and
+    1 times that of the prior. Parameters that are not identifiable have infinite variance. Bierman
+    (1977), Factorization Methods for Discrete Sequential Estimation, chapter IV.
     """
 
     sigma: Array  # (n,), noise levels [N m or N]; only the ratios matter
@@ -221,13 +212,11 @@ class Kalman(Filter[KalmanState]):
     """Kalman filter: theta_k+1 = theta_k + w, tau = Y theta + noise.
 
     The covariance is updated in Joseph's form, P <- (1 - K Y) P (1 - K Y)^T + K R K^T, multiplied
-    out: P - A - A^T with A = K (P Y^T - K T / 2)^T and T = Y P Y^T + R. This form is as robust to
-    an inexact K, exactly symmetric, and its products have only n columns. A row with an improbable
-    innovation is rejected and counted. After 50 rejected rows in a row the next row of the joint is
-    used. A parameter with almost no information from the data is undetermined, and its standard
-    deviation is that of its prior. Bierman (1977), Factorization Methods for Discrete Sequential
-    Estimation, II; Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to
-    Tracking, 5.4.
+    out: P - A - A^T with A = K (P Y^T - K T / 2)^T and T = Y P Y^T + R, exactly symmetric, with
+    products of n columns only. A row with an improbable innovation is rejected; after 50 in a row
+    the next row of the joint is used. A parameter with almost no information is undetermined.
+    Bierman (1977), Factorization Methods for Discrete Sequential Estimation, II; Bar-Shalom, Li,
+    Kirubarajan (2001), Estimation with Applications to Tracking, 5.4.
     """
 
     sigma: Array  # (n,), noise levels [N m or N]
@@ -345,10 +334,9 @@ class DescentState:
 class Descent(RecursiveEstimator[DescentState]):
     """Base class of gradient methods: one step per sample along the gradient, in random order.
 
-    They use scaled parameters x = scale theta, for which every column has unit norm. The residual
-    is e = Psi P^ - tau, with the sign of the paper. ``fit`` reads the samples in several passes,
-    until PRX = 0. A gradient method has no estimate of its uncertainty: the covariance is infinite,
-    rank and condition number are unknown.
+    Parameters x = scale theta, for which every column has unit norm; residual e = Psi P^ - tau,
+    with the sign of the paper. ``fit`` reads the samples in several passes, until PRX = 0. The
+    covariance is infinite, rank and condition number are unknown.
     """
 
     sigma: Array  # (n,), noise level of each joint [N m or N]
@@ -364,7 +352,7 @@ class Descent(RecursiveEstimator[DescentState]):
         return "by step"
 
     @abstractmethod
-    def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
+    def _moved(self, x: Array, Psi: Array, e: Array) -> Array:
         """Return x, shape (c,), after rows Psi (k, c), residuals e (k,), both in units of noise."""
 
     def init(self, c: int) -> DescentState:
@@ -382,7 +370,7 @@ class Descent(RecursiveEstimator[DescentState]):
             return replace(state, steps=steps, skipped=state.skipped + 1)
         # usually all rows are used, and a slice is fast
         used = slice(None) if len(rows) == len(sigma) else np.flatnonzero(sample.weight)
-        x = self._moved(state.x, Psi, Psi @ state.x - tau, used, sample)
+        x = self._moved(state.x, Psi, Psi @ state.x - tau)
         newest = _AVERAGE / (steps + _AVERAGE - 1)
         mean = state.mean + (x - state.mean) * newest if self.average else x
         # residual of this sample for the averaged estimate before it
@@ -411,7 +399,7 @@ class Descent(RecursiveEstimator[DescentState]):
 
     def fit(self, data: Problem) -> Estimate:
         estimator, c = self, len(data.names)
-        if self.scale is None and not self.needs_mass:
+        if self.scale is None:
             estimator = replace(self, scale=column_scale(data, self.sigma))
         state, settled = estimator.init(c), False
         for _ in range(self.passes):
@@ -446,75 +434,32 @@ class Descent(RecursiveEstimator[DescentState]):
 
 @dataclass(frozen=True, eq=False)
 class NormalisedGradient(Descent):
-    """Normalised gradient (NLMS), the fastest recursive estimator.
+    """Normalised gradient (NLMS): theta <- theta - Psi^T e / |Psi|_F^2, rows over their noise.
 
-    theta <- theta - Psi^T e / |Psi|_F^2, e = Psi theta - tau, rows in units of their noise. Without
-    noise |theta~| does not increase. Goodwin, Sin (1984), Adaptive Filtering, Prediction and
-    Control, 3.3.
+    Without noise |theta~| does not increase. Goodwin, Sin (1984), Adaptive Filtering, Prediction
+    and Control, 3.3.
     """
 
-    def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
+    def _moved(self, x: Array, Psi: Array, e: Array) -> Array:
         return x - 1.0 / np.vdot(Psi, Psi) * (e @ Psi)
 
 
 @dataclass(frozen=True, eq=False)
 class PRX(Descent):
-    """The paper's update P^ <- P^ - gamma Psi^T eta (24), with e = Psi P^ - tau.
+    """The paper's update P^ <- P^ - gamma Psi^T e (24), with e = Psi P^ - tau and the exact step.
 
-    * step "printed": eta = D^-1 e, gamma = sigma_D / |Psi|_F^2, sigma_D the smallest eigenvalue of
-      D(q, P^). For an arm with six joints the steps are very small.
-    * step "exact": eta = e, rows in units of their noise; gamma = e^T e / |Psi^T e|^2, the
-      minimiser of |P~| along the direction.
-
-    Without noise |P~| does not increase: with "exact" always, with "printed" if
-    sigma_min(D(q, P^)) <= 2 sigma_min(D(q, P)). With column scaling this is the norm of scale * P~.
-
-    With noise each iterate changes by about the noise of its sample: on recordings of a UR10e and a
-    Panda the prediction error of the last iterate is 1.3 to 1.9 times that of weighted least
-    squares, and that of the average, the k-th iterate weighted by k^2, 1.03 to 1.05 times. ``fit``
-    scales the columns for step "exact" only. Tzvetkova, Extracting Inertial Parameters from Robotic
-    Manipulators Dynamics, (20)-(25).
+    Rows are in units of their noise; gamma = e^T e / |Psi^T e|^2 minimises |P~| along the
+    direction, so that without noise |P~| (with scaling, scale * P~) does not increase. On
+    recordings of a UR10e and a Panda the prediction error of the last iterate is 1.3 to 1.9 times
+    that of weighted least squares, that of the average, the k-th iterate weighted by k^2, 1.03 to
+    1.05 times. Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics,
+    (20)-(25).
     """
 
-    step: str = "exact"  # or "printed"
-
-    def __post_init__(self) -> None:
-        if self.step not in ("exact", "printed"):
-            raise DataError(f"step is {self.step!r}, wanted 'exact' or 'printed'")
-
-    @property
-    def needs_mass(self) -> bool:
-        return self.step == "printed"
-
-    def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
-        if self.step == "exact":
-            direction = e @ Psi
-            square = direction @ direction
-            return x - ((e @ e) / square if square > 0 else 0.0) * direction
-        Psi = sample.Y[used] / self._unit  # rows as in the paper
-        values, vectors = self._inertia(x, sample)
-        e = np.zeros(len(values))
-        e[used] = Psi @ x - sample.tau[used]
-        eta = vectors @ ((e @ vectors) / values)  # D^-1 e (20)
-        gamma = values[0] / np.vdot(Psi, Psi)  # sigma_D / |Psi|_F^2
-        return np.asarray(x - gamma * (eta[used] @ Psi))  # (24)
-
-    def _inertia(self, x: Array, sample: Sample) -> tuple[Array, Array]:
-        """Return eigenvalues and eigenvectors of D(q, P^), which is linear in P^ (11).
-
-        The proof needs a positive definite D: smaller eigenvalues are replaced by a positive bound.
-        """
-        if sample.mass_regressor is None:
-            raise DataError(
-                "PRX needs the mass regressor of each sample, found none; build the problem with "
-                "build_problem(..., with_mass=True)"
-            )
-        D = sample.mass_regressor @ (x / self._unit)  # (n, n)
-        if not np.isfinite(D).all():
-            raise DataError("the mass regressor of the sample is not finite; it was not used")
-        values, vectors = np.linalg.eigh((D + D.T) / 2)
-        largest = float(np.abs(values).max())
-        return np.maximum(values, _SMALLEST * largest if largest > 0 else 1.0), vectors
+    def _moved(self, x: Array, Psi: Array, e: Array) -> Array:
+        direction = e @ Psi
+        square = direction @ direction
+        return x - ((e @ e) / square if square > 0 else 0.0) * direction
 
 
 def column_scale(problem: Problem, sigma: Array) -> Array:

@@ -32,12 +32,6 @@ class ConstraintSettings(Settings):
         "lower and upper corner [[x, y, z], [x, y, z]] of a box in the link's frame that contains "
         "the centre of mass [m]",
     )
-    com_within: str = setting(
-        "none",
-        "constraint on all other centres of mass: inside the box or the convex hull of the link's "
-        "geometry in the URDF (links without geometry or meshes are not constrained); or none",
-        among=("none", "box", "hull"),
-    )
     extent: str = setting(
         "box",
         "constraint on the mass distribution of a link: all mass inside the box of its geometry in "

@@ -1,8 +1,7 @@
 """The logs of a fit, of any length: surveyed once, read in pieces, and reduced to factors.
 
-The survey of a file reads the time stamps of all rows and a few windows of all columns, and
-resolves automatic settings for the whole log. A piece is a fixed range of rows, read with some rows
-before and after it. A log in memory is one piece.
+The survey of a file reads all time stamps and a few windows of all columns, and resolves automatic
+settings. A piece is a fixed range of rows; a log in memory is one piece.
 """
 
 from bisect import bisect_right
@@ -35,7 +34,13 @@ from robotid.data.signals import (
 from robotid.data.units import check_reach, check_units
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.constraint_rows import constrained, logged_base
-from robotid.dynamics.factors import Factors, Reduction, compress_segments, join_segments
+from robotid.dynamics.factors import (
+    Factors,
+    Reduction,
+    compress,
+    compress_segments,
+    join_segments,
+)
 from robotid.dynamics.prediction import is_loaded, remember
 from robotid.dynamics.prepared_logs import (
     base_problem,
@@ -144,10 +149,9 @@ class LogPiece:
 def reduce_piece(piece: LogPiece, threads: int | None = None, *, mapping: BaseMapping) -> Reduction:
     """Return the factors of a piece in base parameters; of no samples if none are usable."""
     rows = piece.read()
-    problem = base_problem(
-        piece.model, mapping, rows.trajectory, rows.mask, compiled=piece.is_compiled
-    )
-    return Reduction.of(problem, rows.trajectory, threads=threads)
+    motion = rows.trajectory
+    problem = base_problem(piece.model, mapping, motion, rows.mask, compiled=piece.is_compiled)
+    return Reduction(compress(problem, threads=threads), motion.squares, len(motion.t))
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,11 +253,7 @@ class SurveyedLog:
         return replace(self, given=self._rows_of(self.model, rows))
 
     def _rows_of(self, model: RobotModel, rows: Rows) -> Rows:
-        """Return rows with those used chosen again, now that they have torques of this robot.
-
-        Static rows were chosen by their speeds already, those of a free base without its jumps and
-        with the forces of its contacts.
-        """
+        """Return rows with those used chosen again, not of static robots and free bases."""
         if model.is_static or model.constraints or rows.trajectory.switching is not None:
             return rows
         mask = row_mask(model, rows.trajectory, self.signals.min_velocity)
@@ -360,10 +360,7 @@ def survey_log(
     *,
     length: int | None = PIECE,
 ) -> SurveyedLog:
-    """Return a surveyed log of a file.
-
-    Every time stamp is checked, units in the windows, the values of a piece when it is read.
-    """
+    """Return a surveyed log of a file, with every time stamp and units in windows checked."""
     locked = {x: layout.positions[x] for x in model.locked if x in layout.positions}
     wanted = list(dict.fromkeys([*layout.wanted, *locked.values()]))
     if length is None:
@@ -624,4 +621,4 @@ class Recordings:
 
     def _whole(self, k: int, motion: Trajectory) -> Iterator[Reduction]:
         """Yield the reduction of a log in memory."""
-        yield Reduction.of(self.problem_of(k, motion), motion)
+        yield Reduction(compress(self.problem_of(k, motion)), motion.squares, len(motion.t))

@@ -93,11 +93,8 @@ class PositionIdentification(Identification):
 
     @cached_property
     def standard_quantile(self) -> Array:
-        """Half-width of the 95 % interval of each standard parameter [standard errors], (p,).
-
-        Of the free parameters that determine it, the one whose standard error has the fewest
-        degrees of freedom gives the quantile.
-        """
+        """Half-width of the 95 % interval of each standard parameter [standard errors], (p,)."""
+        # that of the free parameter with the fewest degrees of freedom of those that determine it
         return _largest_quantile(self._slopes, self.estimate.quantile)
 
     @property
@@ -111,8 +108,7 @@ class PositionIdentification(Identification):
     @cached_property
     def shrunk(self) -> Array:
         """Standard error of each free parameter over its prior spread, shape (c,) [-]."""
-        share: Array = self.estimate.std_error / self.fit.simulator.prior_std
-        return share
+        return np.asarray(self.estimate.std_error / self.fit.simulator.prior_std)
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -262,10 +258,7 @@ def identify_loops(
 
 
 def _others(model: RobotModel, loop: LoopSettings, fitted: Fitted) -> dict[str, Loops]:
-    """Return simpler models by name, for ``run_open_loop``.
-
-    The URDF with the stated gains has no friction and no rotor inertia.
-    """
+    """Return simpler models by name; the URDF's has stated gains, no friction, no rotor inertia."""
     if fitted.linear is not None:
         driven, from_rows = fitted.linear.urdf_with_drives, fitted.linear.standard
         return {"urdf": open_loops(model, driven), "rows": open_loops(model, from_rows)}
@@ -357,8 +350,7 @@ def units_of(model: RobotModel, free: FreeParameter) -> str:
 
 def _largest_quantile(slopes: Array, quantile: Array) -> Array:
     """Return the largest quantile of the parameters on which each quantity depends."""
-    largest: Array = np.where(slopes != 0.0, quantile, QUANTILE).max(axis=1, initial=QUANTILE)
-    return largest
+    return np.asarray(np.where(slopes != 0.0, quantile, QUANTILE).max(axis=1, initial=QUANTILE))
 
 
 def _errors(covariance: Array) -> Array:
@@ -439,10 +431,7 @@ def _named(code: str, names: Sequence[str], **values: Any) -> Finding:  # noqa: 
 
 
 def _settled_delay(examined: Finding, result: PositionIdentification) -> Finding:
-    """Return a finding of the logs; "slow_command" is a note if the fit determines the delay.
-
-    A delay at its bound of 0 is not determined: the data would fit a negative one better.
-    """
+    """Return a finding of the logs; "slow_command" is a note if the fit determines the delay."""
     if examined.code != "slow_command":
         return examined
     estimate, free_parameters = result.estimate, result.fit.simulator.free_parameters
@@ -494,10 +483,7 @@ def _at_bound(result: PositionIdentification) -> Iterator[Finding]:
 
 
 def _unequal_gains(result: PositionIdentification) -> Iterator[Finding]:
-    """Yield which joints with equal limits in the URDF have gains that differ, each fitted alone.
-
-    Equal drives have equal gains: a large difference is an error of one of them.
-    """
+    """Yield which joints with equal limits in the URDF have gains that differ, fitted alone."""
     free = [x for x in result.fit.simulator.free_parameters if x.what == "kp"]
     alike: dict[tuple[str, float, float], list[int]] = {}
     for j in (x.joints[0] for x in free if len(x.joints) == 1):

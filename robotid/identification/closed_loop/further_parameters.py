@@ -76,10 +76,7 @@ def choose(
     offered: Sequence[tuple[FreeParameter, ...]],
     estimator: OutputError,
 ) -> list[Tried]:
-    """Return which candidates lower the residual of held-out windows: theta (c,).
-
-    Selection is greedy: each pass adds the best candidate of each joint.
-    """
+    """Return which candidates lower the residual of held-out windows, greedily by joint."""
     joints = simulator.robot.model.joints
     if len(simulator.windows) == 1:
         _log.warning(
@@ -118,11 +115,8 @@ def choose(
 
 
 def impossible(simulator: LoopSimulator, theta: Array, tried: Sequence[Tried]) -> dict[Tried, str]:
-    """Return the weakest chosen term of each joint whose friction is negative, and the figures.
-
-    Negative friction at some position would drive the joint: no simulation that comes to rest there
-    has a solution. Beyond the range of the data, terms of the position are constant.
-    """
+    """Return the weakest chosen term of each joint whose friction is negative, and the figures."""
+    # such friction would drive the joint: no simulation that comes to rest there has a solution
     model, loops, why = simulator.robot.model, simulator.loops(theta), {}
     weakest = {t.joint: t for t in sorted(tried, key=lambda t: -t.gain) if t.is_chosen}
     for t in weakest.values():
@@ -139,10 +133,7 @@ def impossible(simulator: LoopSimulator, theta: Array, tried: Sequence[Tried]) -
 def _folds(
     simulator: LoopSimulator, theta: Array, estimator: OutputError
 ) -> tuple[Array, Array, int]:
-    """Return the normal equations of each fold of windows, and the number of rows of one joint.
-
-    They are A'A, (K, c, c), and A'b, (K, c), with the prior split equally.
-    """
+    """Return A'A, (K, c, c), and A'b, (K, c), of K folds with equal priors, and rows per joint."""
     count, rows = min(_FOLDS, len(simulator.windows)), 0
     known = 1.0 / simulator.prior_std**2 / count
     H = np.tile(np.diag(known), (count, 1, 1))
@@ -158,11 +149,8 @@ def _folds(
 
 
 def _gains(H: Array, g: Array, columns: list[int], sets: dict[int, list[int]]) -> dict[int, Array]:
-    """Return by how much each set of further columns lowers the squares of each held-out fold.
-
-    All are 0 if the other folds do not determine a parameter, as with short logs: then there is no
-    cross-validation.
-    """
+    """Return by how much each set of further columns lowers the squares of each held-out fold."""
+    # all 0 if the other folds do not determine a parameter, as with short logs
     gains = {s: np.zeros(len(H)) for s in sets}
     base = np.array(columns)
     for k, (H_k, g_k) in enumerate(zip(H, g, strict=True)):
@@ -195,10 +183,7 @@ class GainScale:
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the common factor of all gains is not 1, and every joint is consistent with it.
-
-        Different factors indicate another model error, so that the gains are not questioned.
-        """
+        """Whether the common factor of all gains is not 1, and each joint is consistent with it."""
         error = np.hypot(self.error, self.common_error)
         agree = np.abs(self.change - self.common) <= SIGNIFICANT * error
         is_other = abs(self.common) > max(SIGNIFICANT * self.common_error, _LARGE)
@@ -208,8 +193,8 @@ class GainScale:
 def gain_scale(simulator: LoopSimulator, estimator: OutputError, estimate: Estimate) -> GainScale:
     """Return the scale of the stated gains that bodies, and fitted torques, indicate.
 
-    All drive parameters scale with the gains; weight and inertia of the bodies do not, within their
-    prior. The scale is of first order: one Gauss-Newton step of gains and all free parameters.
+    Drive parameters scale with the gains; weight and inertia of bodies do not. To first order: one
+    Gauss-Newton step of gains and all free parameters.
     """
     n, c, gains = len(simulator.base.kp), len(estimate.theta), []
     for what in ("kp", "kd"):

@@ -75,8 +75,7 @@ class SecondOrder:
     def shows_inertia(self) -> Array:
         """Whether the motion determines the inertia of each joint, shape (n,), bool."""
         found, fastest = self.loops.armature, self.loops.kp / _FREQUENCIES[-1] ** 2
-        shows: Array = (found > _SHOWS * fastest) & (found > _CLEAR * self.inertia_error)
-        return shows
+        return np.asarray((found > _SHOWS * fastest) & (found > _CLEAR * self.inertia_error))
 
     @property
     def inertia(self) -> Array:
@@ -95,8 +94,7 @@ class SecondOrder:
         """Time constant of each joint [s]: of its damping or its oscillation, the longer."""
         loops = self.loops
         damped = (loops.kd + self.friction("viscous")) / loops.kp
-        slow: Array = np.maximum(damped, np.sqrt(loops.armature / loops.kp))
-        return slow
+        return np.asarray(np.maximum(damped, np.sqrt(loops.armature / loops.kp)))
 
     def replaced(self, other: "SecondOrder", joints: Array) -> "SecondOrder":
         """Return the model with the values of another one for some joints: joints (n,)."""
@@ -107,8 +105,7 @@ class SecondOrder:
     def friction(self, name: str) -> Array:
         """Return the values of one friction term, shape (n,)."""
         which = [term.name for term in _TERMS].index(name)
-        values: Array = self.loops.values[which :: len(_TERMS)]
-        return values
+        return np.asarray(self.loops.values[which :: len(_TERMS)])
 
 
 def _loops_with(loops: Loops, other: Loops, joints: Array) -> Loops:
@@ -276,15 +273,13 @@ def _inertia(model: RobotModel, pi: Array, windows: Sequence[Window]) -> Array:
     """Return the typical diagonal of the joint-space mass matrix, shape (n,)."""
     q = np.concatenate([w.log.q[w.counted] for w in windows])
     M = joint_mass_matrices(model, pi, q[:: max(1, len(q) // _POSES)])
-    typical: Array = np.median(np.diagonal(M, axis1=1, axis2=2), axis=0)
-    return typical
+    return np.asarray(np.median(np.diagonal(M, axis1=1, axis2=2), axis=0))
 
 
 def _speed(windows: Sequence[Window]) -> Array:
     """Return the typical speed of each joint, shape (n,)."""
     steps = [np.diff(w.log.q[w.counted], axis=0) / np.median(np.diff(w.log.t)) for w in windows]
-    speed: Array = np.maximum(np.sqrt(np.mean(np.concatenate(steps) ** 2, axis=0)), 1e-6)
-    return speed
+    return np.asarray(np.maximum(np.sqrt(np.mean(np.concatenate(steps) ** 2, axis=0)), 1e-6))
 
 
 def first_loops(
@@ -467,10 +462,7 @@ def find_encoders(model: RobotModel, logs: Sequence[Log]) -> Encoders:
 def _descend(
     model: RobotModel, motion: "_Motion", revolute: Array, free: Sequence[int]
 ) -> tuple[Array, Array, Array, float, Array]:
-    """Return the best sign and zero of each free joint, the gain, and the costs.
-
-    The last two are the least cost, and the cost of each trial of each revolute joint.
-    """
+    """Return sign, zero and gain of each joint, the least cost, and that of each joint's trials."""
     N, n = motion.q.shape
     sign, zero, gain = np.ones(n), np.zeros(n), np.zeros(n)
     first = cost = motion.cost(model, sign, zero)
@@ -520,10 +512,7 @@ class _Motion:
         return len(self.q) * float(np.log(left).sum())
 
     def left(self, model: RobotModel, sign: Array, zero: Array) -> Array:
-        """Return the squared residual of each joint's errors, (n,).
-
-        The torque is left out where its coefficient, the compliance of the loop, is negative.
-        """
+        """Return the squared residual of each joint's errors, (n,), with compliances above 0."""
         q, v, a = (sign * x for x in (self.q, self.v, self.a))
         torque = sign * predict_instants(model, model.standard_parameters(), q + zero, v, a)
         left = self.without.copy()

@@ -45,8 +45,7 @@ class DriveTorques:
     @property
     def limited(self) -> Array:
         """The torque within the limits of the drives [N m or N]."""
-        limited: Array = np.clip(self.unlimited, -self.loops.limit, self.loops.limit)
-        return limited
+        return np.asarray(np.clip(self.unlimited, -self.loops.limit, self.loops.limit))
 
     def slopes(
         self,
@@ -55,10 +54,7 @@ class DriveTorques:
         motion: Array,
         kinds: Mapping[str, int],
     ) -> Array:
-        """Return the derivatives of the torques of some drives, shape (N, k, c).
-
-        The command is constant over a row, so a delay changes only the motion, (N, 2k, c).
-        """
+        """Return derivatives of torques, (N, k, c); delays only change the motion, (N, 2k, c)."""
         k, kp, kd = len(joints), self.loops.kp[joints, None], self.loops.kd[joints, None]
         change: Array = -kp * motion[:, :k] - kd * motion[:, k:]
         at_limit = np.abs(self.unlimited) >= self.loops.limit
@@ -270,10 +266,7 @@ class LoopSimulator:
         return self.robot.roll_out(self.loops(theta), self.windows if windows is None else windows)
 
     def with_better_start(self, theta: Array) -> "LoopSimulator":
-        """Return the simulator with fitted initial states: measured ones have noise.
-
-        With friction an initial error may persist, so that a lead before the window is not enough.
-        """
+        """Return the simulator with fitted initial states: with friction, their errors last."""
         n, loops, columns = len(self.base.kp), self.loops(theta), self._starts()
         windows = [replace(window, first=window.start_row) for window in self.windows]
         for _ in range(_STARTS):
@@ -310,10 +303,7 @@ class LoopSimulator:
         return R[:, :-1] @ (K @ slopes), R[:, -1] - R[:, :-1] @ (K @ pi)
 
     def torque_mismatch(self, theta: Array) -> Array:
-        """Return the relative RMS error of the torques of roll-outs, shape (n,) [-].
-
-        It is relative to the logged torque or that of the roll-outs, whichever is larger.
-        """
+        """Return the RMS torque error of roll-outs over the larger torque, logged or not, (n,)."""
         if self.lag is None:
             return np.zeros(len(self.base.kp))
         loops = self.loops(theta)
@@ -321,8 +311,7 @@ class LoopSimulator:
         outs = (self.fine or self.robot).roll_out(loops, self.windows)
         error = logged - np.concatenate([drive_torques(o, loops, self.lag).limited for o in outs])
         size = np.maximum(np.mean(logged**2, axis=0), np.mean((logged - error) ** 2, axis=0))
-        share: Array = np.sqrt(np.mean(error**2, axis=0) / np.maximum(size, 1e-300))
-        return share
+        return np.asarray(np.sqrt(np.mean(error**2, axis=0) / np.maximum(size, 1e-300)))
 
     def standard(self, model: RobotModel, theta: Array) -> tuple[Array, Array]:
         """Return a robot's standard parameters, shape (p,), and their derivatives, shape (p, c)."""
@@ -388,8 +377,7 @@ class LoopSimulator:
         if self.lag is not None:
             simulated = drive_torques(out, loops, self.lag).limited
             parts.append(out.window.log.tau[counted] - simulated)
-        error: Array = np.hstack(parts)
-        return error
+        return np.asarray(np.hstack(parts))
 
     def _parts(
         self, out: RollOut, error: Array, loops: Loops, columns: list[tuple[int, Column]]
@@ -475,10 +463,8 @@ def terms_of(model: RobotModel, joint: str) -> list[DriveTerm]:
 
 
 def _better_start(out: RollOut, sigma: Array) -> Array:
-    """Return the first-order correction of the initial position and speed, shape (2, n).
-
-    The prior is the measured state, within some position errors and the typical speed.
-    """
+    """Return the first-order correction of the initial position and speed, shape (2, n)."""
+    # the prior is the measured state, within some position errors and the typical speed
     log = out.window.log
     speed = np.sqrt(np.mean((np.diff(log.q, axis=0) / np.diff(log.t)[:, None]) ** 2, axis=0))
     spread = np.maximum(np.concatenate([_NEAR * sigma, speed]), 1e-9)
@@ -492,5 +478,4 @@ def _better_start(out: RollOut, sigma: Array) -> Array:
 
 
 def _error(out: RollOut) -> Array:
-    error: Array = out.window.log.q[out.window.counted] - out.q
-    return error
+    return np.asarray(out.window.log.q[out.window.counted] - out.q)

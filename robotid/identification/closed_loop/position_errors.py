@@ -128,11 +128,7 @@ def run_open_loop(
 
 
 def pool_positions(runs: Sequence[PositionEvaluation], *, moving: bool = False) -> Metrics:
-    """Return the metrics of simulated positions over all logs; joints that move, if ``moving``.
-
-    Relative errors are 100 rmse / spread of the motion, of joints that a log commands to move; all
-    logs have equal weight.
-    """
+    """Return 100 rmse / spread of positions, all logs alike; of joints that move, if ``moving``."""
     per_joint: dict[str, JointMetrics] = {}
     for j, joint in enumerate(runs[0].log.joints):
         if of_joint := [run for run in runs if not moving or run.moves[j]]:
@@ -166,8 +162,7 @@ def _mean(values: Iterable[float]) -> float:
 
 
 def _size(e: Array) -> Array:
-    size: Array = np.sqrt(np.mean(e**2, axis=0))
-    return size
+    return np.asarray(np.sqrt(np.mean(e**2, axis=0)))
 
 
 def _error(robot: ClosedLoopRobot, loops: Loops, log: Log, length: float) -> Array | None:

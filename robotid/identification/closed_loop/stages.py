@@ -26,7 +26,7 @@ from robotid.dynamics.simulation.loops import (
 from robotid.dynamics.simulation.simulation_settings import by_joint
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import OutputError
-from robotid.estimation.fitting.estimator_settings import SimulationSettings
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings, SimulationSettings
 from robotid.identification.closed_loop.further_parameters import (
     GainScale,
     Tried,
@@ -60,7 +60,7 @@ from robotid.identification.closed_loop.loop_simulator import (
     with_terms,
 )
 from robotid.identification.closed_loop.position_errors import DRIFTS
-from robotid.identification.pipeline import identify
+from robotid.identification.pipeline import conclude, in_memory
 from robotid.identification.result import TorqueIdentification
 from robotid.robot.model import RobotModel
 
@@ -116,7 +116,7 @@ def fit_loops(
     progress: ProgressCallback = ignore_progress,
 ) -> Fitted:
     """Fit drives, loops and bodies to logs of commands and positions."""
-    task = _Task(model, logs, loop, settings, signals, progress)
+    task = _Task(model, logs, loop, settings, signals or SignalSettings(), progress)
     _check_logs(logs, loop, settings)
     initialise = _initialise_from_torque if loop.kind == "torque" else _initialise_from_commands
     initialised, theta = _best_start(initialise(task))
@@ -179,7 +179,7 @@ class _Task:
     logs: Sequence[Log]
     loop: LoopSettings
     settings: SimulationSettings
-    signals: SignalSettings | None
+    signals: SignalSettings
     progress: ProgressCallback
 
     def windows(self, logs: Sequence[Log], length: float, lead: float) -> tuple[Window, ...]:
@@ -190,7 +190,8 @@ class _Task:
 
     def from_rows(self, model: RobotModel) -> TorqueIdentification:
         """Return the identification from the torques alone, with the model's friction terms."""
-        return identify(model, self.logs, signals=self.signals, friction="none", doctor=False)
+        recordings = in_memory(model, self.signals, self.logs)
+        return conclude(recordings, EstimatorSettings(), friction="none")
 
     def bodies(self, robot: ClosedLoopRobot) -> list[FreeParameter]:
         """Return the free parameters of bodies."""
@@ -207,10 +208,7 @@ def _with_chosen_terms(
     *,
     passes: int,
 ) -> tuple[LoopSimulator, Estimate, list[Tried]]:
-    """Return the fit with the friction terms that held-out windows confirm, and those tried.
-
-    Terms that were ``dropped`` are not offered again, by name of their first parameter.
-    """
+    """Return the fit with the terms that held-out windows confirm, without ``dropped`` ones."""
     simulator, theta, estimate = fitted  # no estimate of a rough fit
     tried: list[Tried] = []
     for _ in range(passes):
@@ -277,10 +275,7 @@ def _best_start(initial: "_Initial") -> tuple["_Initial", Array]:
 def _with_limits_reached(
     initial: "_Initial", simulator: LoopSimulator, theta: Array
 ) -> tuple[LoopSimulator, Array]:
-    """Return the simulator without limits that were not asked for and do not change the motion.
-
-    A speed gain that only a limit distinguishes from viscous friction is part of it without.
-    """
+    """Return the simulator without limits that were not asked for and do not change the motion."""
     loops = simulator.loops(theta)
     unlimited = replace(loops, limit=np.where(initial.limited, np.inf, loops.limit))
     matters = _errors_of(simulator, unlimited) > BEATEN * _errors_of(simulator, loops)
@@ -298,10 +293,8 @@ def _with_limits_reached(
 
 
 def _first_fit(initial: "_Initial") -> tuple["_Initial", Array, Array]:
-    """Return initial values, the parameters of a first fit to few windows, and its errors.
-
-    It is a fit of the drives alone: with free bodies, many scales have nearly the same residual.
-    """
+    """Return initial values, parameters of a first fit of the drives to few windows, its errors."""
+    # with free bodies, many scales have nearly the same residual
     simulator = initial.simulator
     drives = tuple(free for free in simulator.free_parameters if free.what != "body")
     few = replace(simulator, windows=_few(simulator.windows), free_parameters=drives)
@@ -311,10 +304,7 @@ def _first_fit(initial: "_Initial") -> tuple["_Initial", Array, Array]:
 
 
 def _errors_of(simulator: LoopSimulator, loops: Loops) -> Array:
-    """Return the errors of simulated positions in few windows, shape (n,) [% of RMS motion].
-
-    The error of joints that are not commanded to move is 1 %.
-    """
+    """Return errors of simulated positions in few windows, (n,) [% of RMS motion]; 1 % at rest."""
     outs = simulator.robot.roll_out(loops, _few(simulator.windows))
     q, q_ref = (
         np.concatenate([getattr(out.window.log, name)[out.window.counted] for out in outs])
@@ -557,10 +547,7 @@ def _with(
 
 
 def torque_rows(from_torques: TorqueIdentification, inflation: float = 1.0) -> TorqueRows:
-    """Return an identification's rows reduced to a triangular factor.
-
-    The weights include the variance inflation by correlated rows, from the scatter of segments.
-    """
+    """Return an identification's rows as a triangular factor, weighted by their scatter."""
     weight = from_torques.wls.sigma * np.sqrt(inflation * max(from_torques.errors.inflation, 1.0))
     return TorqueRows(
         from_torques.model, from_torques.factors.weighted(weight), from_torques.mapping.K

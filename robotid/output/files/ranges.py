@@ -270,66 +270,51 @@ def sample(result: Result, count: int, rng: np.random.Generator) -> tuple[list[s
     root *= _quantile(result.content) / QUANTILE
     nominal = np.concatenate([pi, _nominal(result, names[size:])])
     between = _between(result.content)
-    spread = [name in between for name in names]
+    varies = np.array([name in between for name in names], dtype=bool)
     link_parameters(model, pi)  # raises if a link is impossible
     held, terms = held_parameters(model), [name.rpartition(".")[2] for name in names]
     is_positive = np.isin(terms, _POSITIVE) & (np.arange(len(names)) >= size)
     is_bounded = np.isin(terms, [*_NOT_NEGATIVE]) | is_positive
     is_bounded[:size] = model.layout.is_nonnegative()
-    signed, varies = is_bounded.copy(), np.array(spread, dtype=bool)  # drawn anew below
-    is_bounded, is_positive = is_bounded & ~varies, is_positive & ~varies
+    least = np.where(is_bounded, 0.0, -math.inf)
+    is_bounded, is_positive = is_bounded & ~varies, is_positive & ~varies  # drawn anew below
 
     def is_possible(x: Array) -> Array:
         drawn = nominal + x
-        signs = (drawn[:, is_bounded] >= 0.0).all(axis=1) & (drawn[:, is_positive] > 0.0).all(
-            axis=1
-        )
-        bodies = (drawn[:, : model.layout.n_inertial] - held).reshape(-1)
-        are_bodies = _positive_definite(pseudo_inertia(bodies)).reshape(len(x), -1)
-        return np.asarray(signs & are_bodies.all(axis=1))
+        signs = (drawn[:, is_bounded] >= 0.0).all(1) & (drawn[:, is_positive] > 0.0).all(1)
+        J = pseudo_inertia((drawn[:, : model.layout.n_inertial] - held).reshape(-1))
+        minors = [np.linalg.det(J[:, :k, :k]) > 0.0 for k in (1, 2, 3, 4)]  # Sylvester
+        return np.asarray(signs & np.all(minors, axis=0).reshape(len(x), -1).all(1))
 
     x = possible_draws(root, is_possible, count, rng)
     drawn = nominal + x
-    if any(spread):
-        error = np.sqrt((root**2).sum(axis=1))
-        own = [name for name in names if name in between]
-        at = np.flatnonzero(spread)
-        scores = x[:, at] / np.where(error[at] > 0.0, error[at], 1.0)
+    if varies.any():
+        entries = [between[name] for name in names if name in between]
+        error = np.sqrt((root[varies] ** 2).sum(axis=1))
+        scores = x[:, varies] / np.where(error > 0.0, error, 1.0)
         # the rest of the error of the mean is due to the spread, and correlates as it does
-        of_mean, total = np.array([between[name]["errors"] for name in own]).T
-        share = np.minimum(np.minimum(error[at], of_mean) / total, 1.0) ** 2
-        order = [between[name]["at"] for name in own]
+        of_mean, total = np.array([entry["errors"] for entry in entries]).T
+        share = np.minimum(np.minimum(error, of_mean) / total, 1.0) ** 2
+        order = [entry["at"] for entry in entries]
         R = np.array(result.content["variation"]["correlation"])[np.ix_(order, order)]
         z = correlated_scores(scores, share, R, rng.standard_normal(scores.shape))
-        for k, (i, name) in enumerate(zip(at.tolist(), own, strict=True)):
-            least = 0.0 if signed[i] else -math.inf
-            drawn[:, i] = scores_to_values(z[:, k], SCORES, between[name]["quantiles"], least)
+        for k, (i, entry) in enumerate(zip(np.flatnonzero(varies), entries, strict=True)):
+            drawn[:, i] = scores_to_values(z[:, k], SCORES, entry["quantiles"], least[i])
     return names, drawn
-
-
-def _positive_definite(J: Array) -> Array:
-    """Return whether the pivots of symmetric matrices (k, n, n) are positive, shape (k,)."""
-    left = np.array(J.transpose(1, 2, 0), order="C")
-    found = np.ones(len(J), dtype=bool)
-    for k in range(len(left)):
-        found &= left[k, k] > 0.0
-        below = left[k + 1 :, k]
-        left[k + 1 :, k + 1 :] -= below[:, None] * (below / np.where(found, left[k, k], 1.0))
-    return found
 
 
 def _between(content: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return quantiles of the next log, errors of the mean and of it, and number, by parameter."""
-    found: dict[str, dict[str, Any]] = {}
-    entries = {entry["name"]: entry for entry in content["drive_parameters"]}
+    between: dict[str, dict[str, Any]] = {}
+    at_bound = {x["name"] for x in content["drive_parameters"] if x.get("at_bound")}
     parameters = content.get("variation", {}).get("parameters", {})
     for k, (name, entry) in enumerate(parameters.items()):
-        if entries[name].get("at_bound"):
-            continue
-        low, high = entry["next_interval"]
-        errors = entry["std_error"], (high - low) / (2.0 * QUANTILE)
-        found[name] = {"quantiles": np.array(entry["next_quantiles"]), "errors": errors, "at": k}
-    return found
+        if name not in at_bound:
+            low, high = entry["next_interval"]
+            errors = entry["std_error"], (high - low) / (2.0 * QUANTILE)
+            quantiles = np.array(entry["next_quantiles"])
+            between[name] = {"quantiles": quantiles, "errors": errors, "at": k}
+    return between
 
 
 def _quantile(content: Mapping[str, Any]) -> float:
@@ -347,13 +332,12 @@ def _nominal(result: Result, names: list[str]) -> list[float]:
 def _bodies(model: RobotModel, values: Array) -> dict[str, Any]:
     """Return mass, centre of mass, and inertia about it along the link's axes, by link."""
     layout = model.layout
-    own = values[:, : layout.n_inertial] - held_parameters(model)
-    J = pseudo_inertia(own.reshape(-1)).reshape(len(values), -1, 4, 4)
+    bodies = values[:, : layout.n_inertial] - held_parameters(model)
+    J = pseudo_inertia(bodies.reshape(-1)).reshape(len(values), -1, 4, 4)
     m = J[..., 3, 3]
     c = J[..., :3, 3] / m[..., None]
     about = J[..., :3, :3] - m[..., None, None] * c[..., :, None] * c[..., None, :]
-    trace = np.trace(about, axis1=-2, axis2=-1)[..., None, None]
-    inertia = trace * np.eye(3) - about
+    inertia = np.trace(about, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - about
     rows, columns = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
     return {
         body: {
@@ -366,22 +350,21 @@ def _bodies(model: RobotModel, values: Array) -> dict[str, Any]:
 
 
 def _drives(model: RobotModel, names: list[str], values: Array) -> dict[str, dict[str, Any]]:
-    found: dict[str, dict[str, Any]] = {}
+    drives: dict[str, dict[str, Any]] = {}
     for k in range(model.layout.n_inertial, len(names)):
         drive, _, term = names[k].rpartition(".")
-        found.setdefault(drive, {})[term] = values[:, k].tolist()
-    return found
+        drives.setdefault(drive, {})[term] = values[:, k].tolist()
+    return drives
 
 
 def _projected(result: Result, values: Array) -> dict[str, dict[str, Any]]:
-    """Return viscous and Coulomb friction and offset in place of all friction of a drive."""
     model, pi = result.identified
     drives = project_friction(model, pi, result.drive_moments, SIMULATED).drives
-    found: dict[str, dict[str, Any]] = {}
-    for drive in drives:
-        own = values[:, list(drive.own)] @ drive.transfer.T
-        found[drive.name] = {
+    return {
+        drive.name: {
             term: (np.maximum(x, 0.0) if term != "offset" else x).tolist()
-            for term, x in zip(drive.values, own.T, strict=True)
+            for term, T in zip(drive.values, drive.transfer, strict=True)
+            for x in [values[:, list(drive.own)] @ T]
         }
-    return found
+        for drive in drives
+    }

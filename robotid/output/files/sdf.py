@@ -7,10 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from robotid.base.settings import require_kind
 from robotid.base.typing import Array
-from robotid.output.files.exports import Exported, Format, Written
-from robotid.output.files.links import WORLD, SimulatedLink, XmlFormat, write_model
+from robotid.output.files.exports import (
+    WORLD,
+    Exported,
+    Format,
+    SimulatedLink,
+    Written,
+    XmlFormat,
+    write_model,
+)
 from robotid.output.files.result_file import Result
 from robotid.output.files.urdf import numbers_text
 from robotid.robot.bodies import central_inertial
@@ -50,8 +56,6 @@ def write_sdf(
     beyond locked joints have their own inertial. Viscous and Coulomb friction are the joint's
     damping and friction; the armature is Drake's rotor inertia, which Gazebo does not read.
     """
-    require_kind(model, RobotModel, "model", "a robotid.RobotModel")
-    require_kind(notes, (list, tuple), "notes", "a list of sentences")
     gravity = numbers_text(model.pin_model.gravity.linear)
     every = [
         *notes,

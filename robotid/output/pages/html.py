@@ -111,9 +111,7 @@ def with_error(value: float, error: float, *, sign: str = "") -> tuple[Cell, Cel
     """Cells for a number and its error, the error with two digits, both to the same place."""
     if not (math.isfinite(error) and error > 0 and math.isfinite(value)):
         return number(value, f"{sign}.4g"), number(None)
-    exponent = math.floor(
-        math.log10(float(f"{error:.1e}"))
-    )  # of the first digit of the rounded error
+    exponent = int(f"{error:.1e}".partition("e")[2])  # of the first digit of the rounded error
     size = math.floor(math.log10(abs(value))) if value else exponent
     if max(size, exponent) < -3 or exponent > 4:
         digits = max(size - exponent + 1, 0)
@@ -349,10 +347,9 @@ def chart_html(chart: Chart, caption: str, *, points: int = POINTS) -> str:
     x = np.asarray(chart.x, dtype=float)[order]
     series = [(s, _sorted(s.y, order), _sorted(s.half, order)) for s in chart.series]
     rows = _union([y for _, y, _ in series], points, len(x))
-    is_log = "y" in chart.logarithmic
     data = {
         "title": chart.title,
-        "x": _packed(x[rows], is_log="x" in chart.logarithmic, bits=32),
+        "x": _axis(x[rows], chart, "x", "<u4"),
         "series": [
             {
                 "label": s.label,
@@ -360,8 +357,8 @@ def chart_html(chart: Chart, caption: str, *, points: int = POINTS) -> str:
                 "kind": s.kind,
                 "faint": s.is_weak,
                 "hidden": s.is_hidden,
-                "y": _packed(y[rows], is_log=is_log),
-                "half": None if half is None else _packed(half[rows]),
+                "y": _axis(y[rows], chart, "y"),
+                "half": None if half is None else stepped(half[rows]),
             }
             for s, y, half in series
         ],
@@ -372,13 +369,18 @@ def chart_html(chart: Chart, caption: str, *, points: int = POINTS) -> str:
         "logarithmic": chart.logarithmic,
         "height": chart.height,
     }
-    # "<" is an escape in JSON, so no text in it can end the script
-    text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+    text = script_json(data)
     head = f"<figcaption>{caption}</figcaption>" if caption else ""
     return (
         f'<figure class="chart">{head}<noscript>This chart needs JavaScript.</noscript>'
         f'<script type="application/json">{text}</script></figure>\n'
     )
+
+
+def script_json(data: Mapping[str, Any]) -> str:
+    """Return JSON for a script; "<" is an escape, so that no text in it can end the script."""
+    text = json.dumps(data, separators=(",", ":"), allow_nan=False)
+    return text.replace("<", "\\u003c")
 
 
 def thin(y: Array, points: int) -> NDArray[np.int_]:
@@ -407,28 +409,37 @@ def broken(segment: Array, x: Array, *lines: Array) -> tuple[Array, ...]:
     return np.insert(x, ends, between), *(np.insert(y, ends, np.nan) for y in lines)
 
 
+def _axis(values: Array, chart: Chart, axis: str, kind: str = "<u2") -> dict[str, Any]:
+    if axis not in chart.logarithmic:
+        return stepped(values, kind)
+    logarithms = np.log10(np.where(values > 0, values, np.nan))
+    return {**stepped(logarithms, kind), "log": True}
+
+
 def _sorted(values: Array | None, order: NDArray[np.int_]) -> Any:  # noqa: ANN401
     return None if values is None else np.asarray(values, dtype=float)[order]
 
 
 def _union(lines: Sequence[Array], points: int, count: int) -> NDArray[np.int_]:
-    """Return points that are sufficient for every line."""
     if count <= points:
         return np.arange(count)
     share = max(points // len(lines), 8)
     return np.unique(np.concatenate([thin(y, share) for y in lines]))
 
 
-def _packed(values: Array, *, is_log: bool = False, bits: int = 16) -> dict[str, Any]:
-    """Return numbers as base64: steps from low to high, the last code for NaN."""
-    code, last = np.dtype(f"<u{bits // 8}"), 2**bits - 1
-    if is_log:
-        values = np.log10(np.where(values > 0, values, np.nan))
-    finite = np.isfinite(values)
-    known = values[finite]
-    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
-    steps = np.rint((known - low) / ((high - low) or 1.0) * (last - 1))
-    codes = np.full(len(values), last, dtype=code)
-    codes[finite] = steps.astype(code)
-    data = base64.b64encode(codes.tobytes()).decode("ascii")
-    return {"data": data, "low": low, "high": high, "log": is_log, "bits": bits}
+def packed(values: Array, kind: str = "<f4") -> dict[str, Any]:
+    """Return an array for a page: base64 of little-endian numbers."""
+    array = np.ascontiguousarray(values, dtype=kind)
+    data = base64.b64encode(array.tobytes()).decode("ascii")
+    return {"kind": kind, "shape": list(array.shape), "data": data}
+
+
+def stepped(values: Array, kind: str = "<u2") -> dict[str, Any]:
+    """Return columns as whole steps from their lowest to their highest; the last code is NaN."""
+    last, known = int(np.iinfo(kind).max), np.isfinite(values)
+    low = np.where(known, values, np.inf).min(axis=0, initial=np.inf)
+    high = np.where(known, values, -np.inf).max(axis=0, initial=-np.inf)
+    low, high = (np.where(np.isfinite(x), x, 0.0) for x in (low, high))
+    step = np.maximum((high - low) / (last - 1), 1e-30)
+    codes = np.where(known, np.rint((np.where(known, values, low) - low) / step), last)
+    return {**packed(codes, kind), "low": low.tolist(), "step": step.tolist()}

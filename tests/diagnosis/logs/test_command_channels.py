@@ -13,6 +13,7 @@ from helpers.servos import Servo, chirps, record
 from robotid.base.exceptions import DataError
 from robotid.cli.doctor import doctor
 from robotid.data.files.read import read_log
+from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource
 from robotid.diagnosis.logs.command_channels import check_commands
 from robotid.robot.examples import example_urdf
@@ -104,6 +105,14 @@ def test_commands_lost_in_friction_or_backlash_are_named(servo, amplitude):
         f"backlash or the dead band of its drive suppress {(1 - share) * sweep:.2g} rad; move it "
         f"by {5 * (1 - share) * sweep:.2g} rad or more"
     )
+
+
+def test_the_followed_share_of_a_sweep_is_that_at_the_delay_of_the_joint():
+    t = np.arange(0.0, 20.0, 0.005)
+    q_ref = np.abs((0.5 * t + [[0.3], [0.8]]) % 2.0 - 1.0).T  # triangles of 4 s
+    late = np.column_stack([np.interp(t - 0.1, t, x) for x in q_ref.T])
+    log = Log(t, late * [0.4, 1.0], 0 * q_ref, ("a", "b"), q_ref=q_ref, has_torque=False)
+    assert found(log)["small_command"].evidence["followed"] == pytest.approx(0.4, abs=0.002)
 
 
 def test_commands_of_few_steps_of_the_encoder_are_named():

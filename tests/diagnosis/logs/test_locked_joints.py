@@ -87,12 +87,12 @@ def test_positions_and_ranges_have_the_unit_of_their_joint():
     fingers = {"panda_finger_joint1": 0.03, "panda_finger_joint2": 0.03, "panda_joint7": 0.5}
     arm = [f"panda_joint{i}" for i in range(1, 7)]
     panda = RobotModel.from_urdf(example_urdf("panda.urdf"), joints=arm, locked=fingers)
-    logged = (np.linspace(0.0, 0.04, 5), np.full(5, 0.09), np.linspace(0.1, 0.9, 5))
+    logged = (np.linspace(0.0, 0.04, 5), np.full(5, 0.005), np.linspace(0.1, 0.9, 5))
     positions = dict(zip(fingers, logged, strict=True))
     asked, units = list(fingers), LogUnits()
     one, two, seven = check_locked(panda, positions, "run.csv", asked, units)
     assert "is locked at 0.03 m but moves over a range of 0.04 m in the log" in one.message
-    assert "is locked at 0.03 m but is at 0.09 m in the log" in two.message
+    assert "is locked at 0.03 m but is at 0.005 m in the log" in two.message
     assert "is locked at 0.5 rad but moves over a range of 0.8 rad in the log" in seven.message
 
 

@@ -11,7 +11,7 @@ from helpers.paths import ROOT
 
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.residual.discrepancies import _alterations, explain_residual
+from robotid.diagnosis.residual.discrepancies import alterations, explain_residual
 from robotid.diagnosis.residual.misfit import find_misfits
 from robotid.diagnosis.residual.term_trials import take_sample
 from robotid.dynamics.base_parameters import structural_mapping
@@ -131,7 +131,9 @@ def test_columns_are_derivatives_of_the_torque(model):
         ("position_offset", (model.joints[j],)): lambda m, x: replace(m, q=m.q + (x - 1) * one),
         ("torque_scale", (model.joints[j],)): None,
     }
-    found = {(a.code, a.joints): a.Z[..., 0] for a in _alterations(model, pi, sample)}
+    found = {
+        (a.reading.code, a.joints): Z[..., 0] for a, Z in alterations(model, pi, sample).items()
+    }
 
     def torques(change, x):
         return np.concatenate([inverse_dynamics(model, pi, change(m, x)) for m in sample.at])

@@ -3,6 +3,7 @@
 import tomllib
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,8 +14,10 @@ from helpers.paths import ROOT
 
 from robotid.base.findings import Finding
 from robotid.cli.doctor import doctor
+from robotid.cli.identify import identify
 from robotid.cli.job import job_from_settings, read_job
 from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.residual import misfit
 from robotid.diagnosis.residual.misfit import couplings as couplings_of
 from robotid.diagnosis.residual.misfit import (
     find_misfits,
@@ -27,7 +30,6 @@ from robotid.diagnosis.residual.term_trials import RIDGE, Trials, take_sample
 from robotid.diagnosis.verdict.verdict import warnings_of
 from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.identification.pipeline import identify
 from robotid.robot.drives import AUTO
 from robotid.robot.model import RobotModel
 
@@ -125,6 +127,13 @@ def test_a_drift_has_the_trend_of_the_friction_per_minute(three):
     assert "per min" not in finding.message
 
 
+def test_a_coupling_of_some_share_needs_that_of_the_other_joint(monkeypatch):
+    rows = [("a", "b", 0.3), ("b", "a", 0.3), ("c", "b", 0.59), ("d", "c", 0.61), ("d", "", 0.1)]
+    terms = [SimpleNamespace(joint=j, share=x, term=SimpleNamespace(coupled=o)) for j, o, x in rows]
+    monkeypatch.setattr(misfit, "_of_joint", lambda sample, j: [terms[j]])
+    assert find_misfits(SimpleNamespace(joints=rows)) == tuple(terms[k] for k in (0, 1, 3, 4))
+
+
 def test_nothing_is_named_where_nothing_is_missing(clean):
     assert misfits(clean) == ()
 
@@ -205,6 +214,7 @@ def test_a_counterbalance_that_masses_can_imitate_is_never_good(four):
 
 def test_columns_join_the_regressor_and_base_parameters_are_refitted(three):
     sample = take_sample(identified(three, 1, "load", 1, duration=12.0))
+    np.testing.assert_array_equal(np.diff(sample.taken[0]), 1)  # 10 Hz passes of 25: two per sample
     j, b = 2, sample.W.shape[-1]
     Z = np.column_stack([sample.motions[j].q, sample.motions[j].v ** 3])
     trials = Trials(sample.of_joint(j), Z[:, None])
@@ -303,11 +313,11 @@ def test_ripples_that_are_tried_explain_most_over_what_the_filter_lets_through(r
     still = np.zeros(n)
     motion = JointMotion(q, v, still, still, still, still, still, passes=20.0)
     weight, r = rng.uniform(0.5, 2.0, n) * (rng.random(n) < 0.8), rng.standard_normal(n)
-    r += sum(0.4 * np.cos(k * q + k) for k in (9, 41, 230))
+    r += sum(a * np.cos(k * q + k) for a, k in ((0.4, 9), (0.4, 41), (2.0, 230)))
     found = [int(c.name.split()[1]) for c in ripples(motion, weight, weight * r)]
     explained = {}
     for k in range(5, 241):
         size = weight / (1 + (k * np.abs(v) / (2 * np.pi * 20.0)) ** 8)
         explained[k] = np.abs(np.sum(weight * r * size * np.exp(1j * k * q))) ** 2 / (size @ size)
     assert found == sorted(sorted(explained, key=explained.get)[-6:])
-    assert {9, 41} < set(found)
+    assert {9, 41, 230} < set(found)

@@ -16,7 +16,7 @@ from robotid.dynamics.torque import random_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import with_assumed_inertials
-from robotid.robot.urdf_text import read_with_yourdfpy
+from robotid.robot.tree import read_with_yourdfpy
 
 CLEAN = """<robot name="two">
   <link name="base"/>

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from robotid.diagnosis.verdict import parameter_table
+from robotid.diagnosis.verdict.fit_findings import correlated_findings
 from robotid.diagnosis.verdict.parameter_table import (
     central_parameters,
     correlated_parameters,
@@ -91,6 +92,12 @@ def test_a_parameter_is_correlated_with_another_one_of_its_own_drive_that_has_an
     pairs = correlated_parameters(found)
     assert {i: k for i, (k, _) in pairs.items()} == {i: k for i, (k, _) in wanted.items()}
     assert [r for _, r in pairs.values()] == pytest.approx([r for _, r in wanted.values()])
+    names = [f"{'xab'[(i + 2) // 4]}.{i}" for i in range(10)]
+    layout.names, layout.prismatic, found.drives = names, (), ()
+    found.standard = found.standard_error = np.ones(10)
+    line = np.linspace(0.0, 1.0, 3)
+    found.friction = lambda joint: SimpleNamespace(v=line, torque=line, std=line)
+    assert [f.evidence["r"] for f in correlated_findings(found)] == pytest.approx([-0.97, 0.951])
 
 
 def test_sets_are_joined_by_correlations_of_either_sign_and_hold_numbers_of_all_parameters():

@@ -59,6 +59,7 @@ def test_any_total_mass_of_a_fixed_arm_fits_and_none_verifies(lifted, times):
     assert (found.stated.verifies, found.stated.contradicts) == (False, False)
     assert found.contradicts is found.has_one_factor
     assert model.layout.bodies[0] in found.stated.absorbed_by
+    assert [x.to_dict()["is_stated"] for x in (free, found)] == [False, True]
     assert "The stated total_mass does not verify the scale: torque does not" in found.message
     assert "Verify it with a payload of known mass (robotid payload)" in found.message
 

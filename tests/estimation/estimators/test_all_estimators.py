@@ -71,8 +71,7 @@ def noisy():
     W, tau, weight = (np.concatenate(x) for x in zip(*problem.blocks(), strict=True))
     torques = [tau + (noise * rng.standard_normal((150, 3))).ravel() for _ in range(60)]
     blocks = ([(W, torque, weight)] for torque in torques)
-    own = {"mass_stream": None, "sources": ()}
-    return case, [replace(problem, stream=partial(iter, block), **own) for block in blocks]
+    return case, [replace(problem, stream=partial(iter, block), sources=()) for block in blocks]
 
 
 @makers(EXACT_COVARIANCE)

@@ -201,6 +201,9 @@ def test_an_estimator_that_reads_samples_counts_the_shift_as_an_error(planar, mo
     assert not noise.is_corrected
     np.testing.assert_allclose(rls.base - noise.shift, wls.base, rtol=1e-3, atol=1e-4)
     assert (rls.base_error >= 0.95 * np.abs(noise.shift)).all()
+    score = rls.factors.information(rls.wls.sigma**-2.0) @ noise.shift
+    wanted = wls.regressor_noise.meat + np.outer(score, score)
+    np.testing.assert_allclose(noise.meat, wanted, rtol=1e-6, atol=1e-9 * np.abs(wanted).max())
     (finding,) = [f for f in rls.findings if f.code == "encoder_noise"]
     assert "its standard errors include it" in finding.message
 

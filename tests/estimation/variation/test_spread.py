@@ -11,6 +11,7 @@ from robotid.estimation.variation.spread import (
     Mixture,
     Runs,
     SpreadModel,
+    _alone,
     correlated_scores,
     possible_draws,
     root_of,
@@ -128,6 +129,16 @@ def test_a_run_that_tells_nothing_of_a_parameter_changes_nothing():
         assert one.ends == pytest.approx(two.ends)
         assert (one.mean, one.spread) == pytest.approx((two.mean, two.spread))
     assert SpreadModel(more.without(4)).runs.h.tolist() == runs.h.tolist()
+
+
+def test_one_parameter_alone_has_the_others_integrated_out_of_each_run():
+    runs, spread = drawn(np.random.default_rng(8), [0] * 3, np.ones((2, 2))), np.array([0.3, 0.8])
+    for p in (0, 1):
+        W, w = _alone(runs.H, runs.h, spread, p)
+        prior = np.diag(np.where(np.arange(2) == p, 0.0, spread**-2.0))
+        C = np.linalg.inv(runs.H + prior)
+        np.testing.assert_allclose(W, 1.0 / C[:, p, p])
+        np.testing.assert_allclose(w / W, np.einsum("ki,ki->k", C[:, p], runs.h))
 
 
 @pytest.mark.parametrize(("runs", "ratio", "next_run", "spread"), [

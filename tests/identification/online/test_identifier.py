@@ -120,7 +120,7 @@ def test_before_the_robot_has_moved_there_is_no_estimate(ur5):
     with pytest.raises(DataError, match="there is no change -1: 0 were flagged"):
         identifier.payload()
     # of two hundred instants a second every other one is a step; one joint that moves is enough
-    signals, seen = LiveSignals(6, 200.0, 8.0, 4, np.zeros(6, dtype=bool)), 0
+    signals, seen = LiveSignals(6, 200.0, 8.0, np.zeros(6, dtype=bool)), 0
     identifier = OnlineIdentifier(ur5)
     for k in range(140):
         q = np.append(np.zeros(5), k / 200.0)

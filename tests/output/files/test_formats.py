@@ -14,7 +14,7 @@ from helpers.paths import DOCS, ROOT
 from robotid.cli.export import export
 from robotid.output.files.exports import formats
 from robotid.output.files.result_file import load_result
-from robotid.robot.urdf_text import read_with_yourdfpy
+from robotid.robot.tree import read_with_yourdfpy
 
 #: How the consumer of each format reads the stiffness or the Coulomb friction of a joint.
 CONSUMERS = {

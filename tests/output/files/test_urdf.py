@@ -1,4 +1,5 @@
 import hashlib
+import json
 import re
 
 import numpy as np
@@ -10,8 +11,7 @@ from robotid.dynamics.torque import random_regressor
 from robotid.output.files.urdf import load_identified, write_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling, pseudo_inertia
-from robotid.robot.tree import read_tree
-from robotid.robot.urdf_text import read_with_yourdfpy
+from robotid.robot.tree import read_tree, read_with_yourdfpy
 
 # three joints; a tool on a fixed joint, a frame without inertial, and much that is no dynamics
 RICH = """\ufeff<?xml version="1.0" encoding="utf-8"?>
@@ -97,6 +97,15 @@ def test_written_files_give_the_torque_of_the_parameters(source, tmp_path, rng, 
     pi = possible_parameters(model, rng)
     sidecar = write_urdf(model, pi, tmp_path / "new.urdf")
     assert sidecar == tmp_path / "new.drive.json"
+    units = json.loads(sidecar.read_text())["units"]
+    assert (
+        units.items()
+        >= dict(
+            zip(
+                model.layout.drive_names, model.layout.units[model.layout.n_inertial :], strict=True
+            )
+        ).items()
+    )
     loaded, read_back = load_identified(tmp_path / "new.urdf", sidecar)
     assert_same_torque(model, pi, loaded, read_back)
     np.testing.assert_array_equal(

@@ -17,7 +17,7 @@ from robotid.base.files import write_json
 from robotid.cli import main
 from robotid.data.files.read import write_log
 from robotid.output.files.result_file import read_result
-from robotid.output.report.comparison import compare_results, write_comparison
+from robotid.output.report.comparison import compare_results, fleet_page, write_comparison
 from robotid.robot.model import RobotModel
 
 
@@ -169,3 +169,16 @@ def test_results_and_logs_of_one_name_are_told_apart_by_the_shortest_path(folder
     for label, name in zip("ABC", ("monday/out", "tuesday/out", "wls"), strict=True):
         assert f"<p>{label} {name}: <strong>" in html
     assert [x["name"] for x in compare_results(places[:2])["results"]] == ["monday", "tuesday"]
+
+
+def test_the_failures_of_a_fleet_are_counted_and_the_first_of_each_kind_stand_first():
+    said = [("a", "", "a: no torque"), ("b", "b.csv", "b.csv: no torque"), ("c", "", "c: no URDF"),
+            ("d", "", "d: no torque")]  # fmt: skip
+    failures = [dict(zip(("unit", "log", "error"), words, strict=True)) for words in said]
+    content = {"failures": failures, "unlike": [], "parameters": [], "done": 0, "units": 4,
+               "logs": 4, "verdicts": {}}  # fmt: skip
+    shown = tables(fleet_page(content))["Units and logs that were not identified"]
+    assert shown.rows == [
+        ["a", "all", "3", "a: no torque"], ["c", "all", "1", "c: no URDF"],
+        ["b", "b.csv", "3", "b.csv: no torque"], ["d", "all", "3", "d: no torque"],
+    ]  # fmt: skip

@@ -3,9 +3,11 @@
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import pytest
 
+from robotid.output.report.motion_page import _collisions
 from robotid.output.report.report_content import write_report
 
 VOID = {"meta", "br", "wbr", "link", "img", "input", "hr", "path", "use"}
@@ -78,6 +80,9 @@ def test_ids_are_unique_and_every_reference_finds_one(report):
 def test_verdict_comes_first_then_how_it_was_made(report, identified, findings):
     text, verdict = Reader(report).text, replace(identified, findings=findings).verdict
     order = [f"Verdict: {verdict.status}", verdict.reasons[0], "Total mass", "Do next"]
+    fitted = [e.recording.extent for e in identified.fitted]
+    samples, rows = sum(x.smooth for x in fitted), sum(x.rows_used for x in fitted)
+    order.append(f"({samples} samples after filtering, {rows} torque values used)")
     order += ["cut-off 12 Hz, order 4", "velocity measured", "Errors", "Findings", "Torques"]
     order += ["Parameters", "Appendix", "Base parameters", "SHA-256"]
     places = [text.index(order[0])]
@@ -103,6 +108,16 @@ def test_a_joint_worse_than_the_urdf_is_flagged(identified, text_of):
     text = text_of(replace(identified, validation=(replace(kept, metrics=changed),)))
     assert "Verdict: poor" in text
     assert "worse than the URDF" in text[text.index("100 |τ") :]
+
+
+def test_the_distance_at_a_collision_is_its_margin_and_what_is_required():
+    entry = {"margin": 0.012, "where": "a and b", "time": 1.5, "kept": 0.02}
+    entry |= {"unread": [], "left_alone": ["c and d"], "built_near": []}
+    course = SimpleNamespace(nearest=None, clearance=object())
+    assert Reader(_collisions({"limits": {"collision": entry}}, course)).text == (
+        "Smallest margin to a collision: a and b, distance 32 mm at 1.50 s. Required: 20 mm, also "
+        "between samples. Not checked, since in contact by design: c and d."
+    )
 
 
 def test_without_a_validation_log_the_fitted_rows_are_drawn(identified, text_of):

@@ -1,7 +1,9 @@
 """The page of an identification that predicts positions: its figures are those of the logs."""
 
+import json
 import re
 from dataclasses import replace
+from html import unescape
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from helpers.pages import bars, charts, tables
 
 from robotid.base.findings import Finding
 from robotid.output.report.next_steps import Origin
-from robotid.output.report.report_content import write_report
+from robotid.output.report.report_content import Residual, worst_second, write_report
 
 JOINTS = ("rail", "turn")
 
@@ -74,6 +76,27 @@ def test_positions_of_each_log_are_drawn(found, page):
     )
     assert f"{run.name}, not fitted: RMSE {1e3 * run.rmse[1]:.3g} mrad" in page
     assert f"{found.fitted[0].name}, fitted: RMSE" in page
+
+
+def test_the_worst_second_is_in_mrad_and_the_replay_knows_when_each_log_ends(found, tmp_path):
+    page = page_of(found, tmp_path, files={"replay": "replay.html"})
+    [run] = found.validation
+    left = run.log.q[:, 1] - run.q[:, 1]
+    worst = worst_second([Residual(run.name, run.log.name, run.log.t, left)])
+    at = f"{worst.start:.2f} to {worst.end:.2f} s, RMS {1e3 * worst.rms:.3g} mrad"
+    assert f"Largest residual within 1 s: {run.name}, {at}" in page
+    clips = json.loads(unescape(re.search(r'data-clips="(.*?)"', page)[1]))
+    ends = [(e.log.t[0], e.log.t[-1]) for e in (*found.validation, *found.fitted)]
+    assert [(clip["start"], clip["end"]) for clip in clips] == ends
+
+
+def test_drives_stand_side_by_side_and_delays_in_milliseconds(found, page):
+    estimate, free = found.fit.estimate, found.fit.simulator.free_parameters
+    (k,) = (k for k, x in enumerate(free) if x.what == "delay" and 0 in x.joints)
+    shown = tables(page)["Drives, by joint"].by_name()["rail"]["delay [ms]"]
+    value, error = (float(x) for x in shown.split(" ± "))
+    assert value == pytest.approx(1e3 * estimate.theta[k], abs=0.6 * error)
+    assert error == pytest.approx(1e3 * estimate.std_error[k], rel=0.05)
 
 
 def test_parameters_findings_and_commands_are_shown(found, page):

@@ -12,7 +12,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.base.files import write_json
 from robotid.base.findings import Finding
-from robotid.identification.pipeline import identify
+from robotid.cli.identify import identify
 from robotid.output.files.entries import build_result
 from robotid.output.report.comparison import write_comparison
 from robotid.output.report.report_content import write_report

@@ -99,6 +99,17 @@ def test_every_keyframe_is_the_robot_s_pose(arm, motion, page):
             np.testing.assert_allclose(pose.homogeneous, true.homogeneous, atol=1e-6)
 
 
+def test_the_other_quaternion_of_a_pose_moves_no_base(arm):
+    floating = RobotModel.from_urdf(arm.tree.path, free_flyer=True)
+    t, turn = np.arange(90) / 30.0, np.linspace(0.0, 1.0, 90)
+    base = (turn, turn**2, -turn, 0 * turn, 0 * turn, np.sin(turn), np.cos(turn))
+    q = np.column_stack([*base, turn, turn])
+    other = q.copy()
+    other[20:61, 3:7] *= -1.0
+    one, two = (shown(replay(floating, t, x).html)["motion"]["q"] for x in (q, other))
+    np.testing.assert_allclose(two, one, atol=1e-6)
+
+
 def test_torques_are_plotted_with_gaps_and_the_units_of_their_joints(arm, motion):
     t, q = motion
     t = np.where(t > 6.0, t + 1.0, t)

@@ -59,10 +59,10 @@ function tickWords(_, ticks) { // with as many digits as their step needs
   return ticks.map((tick) => (tick + 0).toFixed(digits).replaceAll("-", "−"));
 }
 
-function unpack({ data, low, high, log, bits }) { // numbers from steps between low and high
+function unpack({ kind, data, low, step, log }) { // numbers in steps from the lowest
   const bytes = Uint8Array.from(atob(data), (c) => c.charCodeAt(0));
-  const codes = bits === 32 ? new Uint32Array(bytes.buffer) : new Uint16Array(bytes.buffer);
-  const last = 2 ** bits - 1, step = (high - low) / (last - 1); // the last code is no number
+  const codes = kind === "<u4" ? new Uint32Array(bytes.buffer) : new Uint16Array(bytes.buffer);
+  const last = 2 ** (8 * codes.BYTES_PER_ELEMENT) - 1; // which is no number
   return Float64Array.from(codes, (code) => {
     const value = code === last ? NaN : low + code * step;
     return log ? 10 ** value : value;

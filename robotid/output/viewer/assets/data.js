@@ -10,23 +10,20 @@ function element(tag, attributes = {}, ...children) {
   return made;
 }
 
-function unpack({ kind, data: text }) {
+function unpack({ kind, shape, data: text, low, step }) {
   const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
-  if (kind === "<u2") return new Uint16Array(bytes.buffer);
-  return kind === "<u4" ? new Uint32Array(bytes.buffer) : new Float32Array(bytes.buffer);
-}
-
-function unpackColumns({ low, step, codes }) { // numbers in steps of their column
-  const width = codes.shape[1];
-  return Float32Array.from(unpack(codes), (code, i) =>
+  if (kind === "<f4") return new Float32Array(bytes.buffer);
+  const codes = kind === "<u2" ? new Uint16Array(bytes.buffer) : new Uint32Array(bytes.buffer);
+  const width = shape[1];
+  return !step ? codes : Float32Array.from(codes, (code, i) => // in steps of their column
     (code === 65535 ? NaN : low[i % width] + step[i % width] * code));
 }
 
 class Table { // times of the log and rows of numbers; in the page times are from the start
   constructor(t, values) {
     this.t = t ? Array.from(unpack(t), (x) => data.start + x) : [];
-    const flat = !values ? [] : values.codes ? unpackColumns(values) : unpack(values);
-    const width = values ? (values.codes || values).shape[1] : 0;
+    const flat = values ? unpack(values) : [];
+    const width = values ? values.shape[1] : 0;
     this.rows = this.t.map((_, k) => Array.from(flat.subarray(k * width, (k + 1) * width)));
   }
   get end() { return this.t.length ? this.t[this.t.length - 1] : data.start; }

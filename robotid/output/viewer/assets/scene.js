@@ -23,10 +23,9 @@ try {
 
 // ---- the bodies: one mesh per joint, with the colours of its parts at its corners --------------
 
-const meshes = data.scene.meshes.map(({ low, step, vertices, faces, closed }) => {
+const meshes = data.scene.meshes.map(({ vertices, faces, closed }) => {
   const made = new THREE.BufferGeometry();
-  const places = Float32Array.from(unpack(vertices), (x, i) => low[i % 3] + step[i % 3] * x);
-  made.setAttribute("position", new THREE.BufferAttribute(places, 3));
+  made.setAttribute("position", new THREE.BufferAttribute(unpack(vertices), 3));
   made.setIndex(new THREE.BufferAttribute(unpack(faces), 1));
   made.computeVertexNormals();
   made.userData.isOpen = !closed;
