@@ -1,7 +1,6 @@
 """Distribution of work on pieces to processes of this machine, or those of a Dask cluster.
 
-Every piece is processed independently with one BLAS thread, so that its result has the same bits in
-any process, also if a worker ends and its piece is repeated.
+Every piece has one BLAS thread, so that its result has the same bits in any process.
 """
 
 import logging
@@ -73,8 +72,7 @@ class WorkPlan:
     """Distribution of work on pieces: in this process, worker processes or a Dask cluster.
 
     It never changes a result. As a context manager, it reuses its workers until the context ends.
-    They end with the process that started them. The workers of a cluster must be able to read the
-    logs under the same path.
+    The workers of a cluster must be able to read the logs under the same path.
     """
 
     workers: int | None = 1  # worker processes; None: one per core for long work
@@ -167,7 +165,7 @@ class WorkPlan:
         """Yield the results of pieces with their indices; closing the iterator ends the work.
 
         At most two pieces per worker are submitted. If a worker ends, the pieces under way are
-        repeated one after the other, so that the piece that ends its worker is known.
+        repeated one by one, so that the piece that ends its worker is known.
         """
         waiting = iter(pieces)
         running: dict[Future[_Outcome], tuple[int, Workload]] = {}
@@ -367,10 +365,7 @@ def _end_after(parent: int) -> None:
 
 
 def choose_workers(pieces: Sequence[Workload], workers: int | None = None) -> int:
-    """Return the number of worker processes, at most that of the pieces.
-
-    It is the given number; else one per core if the work is long, otherwise 1.
-    """
+    """Return the number of worker processes: as given, else the cores for long work."""
     if workers is None:
         is_long = sum(piece.samples for piece in pieces) >= _WORTH_WORKERS
         workers = available_cores() if is_long else 1

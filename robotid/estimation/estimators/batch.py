@@ -31,10 +31,9 @@ _ALONE = 1e-6  # relative gap of the two smallest singular values below which th
 
 @dataclass(frozen=True)
 class OLS(BatchEstimator):
-    """Ordinary least squares: minimise |tau - W theta|^2.
+    """Ordinary least squares: minimise |tau - W theta|^2, with a noise level for each joint.
 
-    The covariance has a separate noise level for each joint,
-    ``(W^T W)^-1 (sum_j sigma_j^2 W_j^T W_j) (W^T W)^-1``.
+    The covariance is ``(W^T W)^-1 (sum_j sigma_j^2 W_j^T W_j) (W^T W)^-1``.
     """
 
     #: Parameter values for directions that are not identifiable, shape (c,); None: an error if any.
@@ -59,9 +58,9 @@ class OLS(BatchEstimator):
 class WLS(BatchEstimator):
     """Weighted least squares: minimise sum_j |tau_j - W_j theta|^2 / sigma_j^2.
 
-    The noise level sigma_j of each joint is computed from its residual and the effective degrees of
-    freedom of its rows, and is iterated to convergence, which may be slow with few rows. Gautier
-    (1997), Dynamic identification of robots with power model, section II.
+    The noise level sigma_j of each joint is iterated, from its residual and the effective degrees
+    of freedom of its rows. Gautier (1997), Dynamic identification of robots with power model,
+    section II.
     """
 
     prior: Array | None = None  # as in ``OLS``
@@ -99,12 +98,11 @@ class WLS(BatchEstimator):
 class TLS(BatchEstimator):
     """Total least squares with exact columns, rows weighted as in WLS.
 
-    Finds the smallest corrections E of the regressor and e of the torque with
-    (W + E) theta = tau - e. The noise of a column is ``regressor_noise`` times its RMS; constant
-    columns have none. It is biased if the residual is a model error, which it attributes to noise
-    of the regressor. For ``regressor_noise`` towards 0 it is WLS, whose covariance it returns.
-    Golub, Hoffman, Stewart (1987), A generalization of the Eckart-Young-Mirsky matrix approximation
-    theorem; Van Huffel, Vandewalle (1991), The Total Least Squares Problem, 3.6.
+    Finds the smallest corrections E of the regressor and e of the torque with (W + E) theta = tau -
+    e. Constant columns have no noise. It attributes errors of the model to noise of the regressor;
+    for ``regressor_noise`` towards 0 it is WLS, whose covariance it returns. Golub, Hoffman,
+    Stewart (1987), A generalization of the Eckart-Young-Mirsky matrix approximation theorem; Van
+    Huffel, Vandewalle (1991), The Total Least Squares Problem, 3.6.
     """
 
     #: RMS noise of the columns over their RMS [-]; None: 0.01, reduced if it exceeds half of the
@@ -134,8 +132,8 @@ class TLS(BatchEstimator):
     def _split(self, R: Array, noise: Array, theta: Array) -> tuple[Array, float]:
         """Return the parameters and the share of the residual due to the regressor's noise.
 
-        The residual of WLS, 1 in these units, is the sum of the torque's noise and the regressor's
-        noise times theta. Share and theta depend on each other: both are iterated.
+        The residual of WLS, 1 in these units, is noise of the torque and of the regressor times
+        theta.
         """
         for _ in range(_MAX_ITERATIONS):
             share = float(((noise * theta) ** 2).sum())
@@ -214,10 +212,7 @@ def solve_factor(factors: Factors, sigma: Array, prior: Array | None) -> Solutio
 
 
 def _noise(factors: Factors, theta: Array, used: Array) -> Array:
-    """Return the standard deviation of each joint's residual, above 0, shape (n,) [N m or N].
-
-    The degrees of freedom are the rows minus ``used``, the trace of their leverage.
-    """
+    """Return each joint's noise level, (n,) [N m or N]: ``used`` is the leverage of its rows."""
     sigma = factors.noise_levels(theta, np.maximum(factors.rows - used, 1.0))
     torque = np.sqrt(factors.torque_squares() / np.maximum(factors.rows, 1))
     floor = _FLOOR * np.where(torque > 0, torque, 1.0)

@@ -1,8 +1,4 @@
-"""Physically consistent fit: a convex programme on the triangular factors, any data and weight.
-
-The weight of its prior is chosen, and extents of bodies are tested, by cross-validation on segments
-of the fitted data.
-"""
+"""Physically consistent fit: a convex programme on the triangular factors, any data and weight."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -204,22 +200,20 @@ class WeightChoice:
 
 @dataclass(frozen=True, eq=False)
 class Consistent(BatchEstimator):
-    """Fit of physically consistent standard parameters, regularised by a prior.
+    """Fit of physically consistent standard parameters pi, regularised by a prior.
 
-    Minimises, over the standard parameters pi,
+    Minimises
 
         sum_j |tau_j - W_b,j K pi|^2 / sigma_j^2 + prior_weight penalty(pi)
 
     subject to armature, viscous and Coulomb coefficients >= 0, and the other constraints. The
     penalty, twice the Bregman divergence of -log det from the prior's pseudo-inertias, is infinite
     unless each J(pi_i) - J(held_i) is positive definite; for the drives it is quadratic. The noise
-    levels sigma_j are those of weighted least squares.
-
-    The estimate contains the p standard parameters. Its covariance is that without the inequalities
-    (see ``Programme.redrawn``). Its rank, condition number and undetermined names refer to the base
-    parameters. Sousa, Cortesao (2014), Physical feasibility of robot base inertial parameter
-    identification: a linear matrix inequality approach; Wensing, Kim, Slotine (2018), Linear Matrix
-    Inequalities for Physically Consistent Inertial Parameter Identification, (8).
+    levels sigma_j are those of weighted least squares. The covariance is that without the
+    inequalities (see ``Programme.redrawn``); rank, condition number and undetermined names refer to
+    the base parameters. Sousa, Cortesao (2014), Physical feasibility of robot base inertial
+    parameter identification: a linear matrix inequality approach; Wensing, Kim, Slotine (2018),
+    Linear Matrix Inequalities for Physically Consistent Inertial Parameter Identification, (8).
     """
 
     layout: ParameterLayout
@@ -259,8 +253,7 @@ class Consistent(BatchEstimator):
         """Return the physically consistent standard parameters nearest to an estimate.
 
         Minimises (K pi - beta)^T C^-1 (K pi - beta) + prior_weight penalty(pi) under the
-        constraints of ``fit``, with the covariance C of the estimate of base parameters, as that of
-        a recursive estimator at any time. Parameters with infinite variance are not used.
+        constraints of ``fit``, C the covariance. Parameters with infinite variance are not used.
         """
         known = np.flatnonzero(np.isfinite(np.diag(estimate.covariance)))
         if not len(known):
@@ -288,10 +281,9 @@ class Consistent(BatchEstimator):
         )
 
     def noise(self, factors: Factors) -> Array:
-        """Return the noise levels of weighted least squares, shape (n,) [N m or N].
+        """Return the noise levels of weighted least squares without a prior, shape (n,) [N m or N].
 
-        They do not depend on the prior: a wrong one would otherwise make the data seem noisy. The
-        parameters use as many independent rows as the trace of their leverage.
+        The parameters use as many independent rows as the trace of their leverage.
         """
         sigma, prior = self.wls_noise, self.K @ self.prior
         if sigma is None:
@@ -305,10 +297,7 @@ class Consistent(BatchEstimator):
         return np.asarray(np.maximum(level, least))
 
     def rows(self, factors: Factors, sigma: Array) -> Array:
-        """Return rows [R d], shape (b + 1, b + 1): |R K pi - d|^2 is the weighted cost of the data.
-
-        The noise level of joints, sigma, has shape (n,) [N m or N].
-        """
+        """Return rows [R d], (b + 1, b + 1), of the weighted cost |R K pi - d|^2: sigma (n,)."""
         return factors.weighted(sigma / np.sqrt(self.independent_share))
 
     @cached_property
@@ -325,11 +314,7 @@ class Consistent(BatchEstimator):
 
     @property
     def weight_ratio(self) -> float:
-        """Weight of the prior over its plausible weight, at least 1 [-].
-
-        A large weight means that parameters near the prior explain the data: those that the data do
-        not determine are as uncertain as at ``plausible_weight``.
-        """
+        """Weight of the prior over its plausible weight, by which errors are stated, at least 1."""
         return max(self.prior_weight / self.plausible_weight, 1.0)
 
     @property
@@ -376,11 +361,10 @@ class Consistent(BatchEstimator):
 
 
 def slabs(box: Array) -> Array:
-    """Return the matrices Q_k, shape (3, 4, 4), with tr(J Q_k) >= 0 for all mass inside a box.
+    """Return matrices Q_k, (3, 4, 4), with tr(J Q_k) >= 0 for all mass inside a box (slabs).
 
-    Every mass element with x_k between the corners l and u has (x_k - l_k) (u_k - x_k) >= 0; the
-    integral over the body is tr(J Q_k) (Wensing, Kim, Slotine, 2018, Linear Matrix Inequalities for
-    Physically Consistent Inertial Parameter Identification, (12), its ellipsoid being a slab).
+    It is the integral of (x_k - l_k) (u_k - x_k) over the body, u and l the corners (Wensing, Kim,
+    Slotine, 2018, see ``Consistent``, (12), its ellipsoid being a slab).
     """
     Q = np.zeros((3, 4, 4))
     for k, (low, high) in enumerate(box.T.tolist()):
@@ -476,14 +460,13 @@ def choose_weight(
     """Return the weight of the prior, chosen from the fitted data.
 
     * "cv": the largest weight with the same prediction error on held-out segments as the best one,
-      see ``_is_accepted``. A repeated error has no scatter between segments, and a smaller weight
-      that only fits it is not better. The error of no joint may be more than 10 % above that of
-      least squares: where the prior is wrong, as of a placeholder, the weight is smaller.
+      see ``_is_accepted``. A repeated error has no scatter between segments. The error of no joint
+      may be more than 10 % above that of least squares, as where the prior is a placeholder.
     * "evidence": the weight with the largest ``log_evidence``.
 
     Weights are tried from 100 down to 0.1, and to 1e-4 where least squares is better, in decades,
-    until two weights in a row are worse than those before, and then around the best one. A weight
-    at which the fit does not converge, because bodies shrink to points, has an infinite error.
+    until two in a row are worse than those before, and then around the best one. A weight at which
+    the fit does not converge, because bodies shrink to points, has an infinite error.
     """
     evidence = log_evidence(fit, segments.rows)
     by_evidence = _search(lambda w: (-evidence(w), np.zeros(0)), "evidence", 0.0)
@@ -528,13 +511,12 @@ def loss_of(fit: Consistent, segments: Segments, weight: float) -> float:
 def plausible_weight(fit: Consistent, rows: Array, weight: float) -> float:
     """Return the weight at which the distance from the prior is as expected, or the given one.
 
-    The evidence expands the penalty at its centre. At the minimum with a weight w that agrees with
-    the data, w times the penalty is the number of parameters that the data determine, g = d -
-    trace(w H C / 2) of d free ones (MacKay, 1992, Bayesian interpolation, section 4). If it is
-    more, or less than half, as far from the centre the penalty is not quadratic, the next weight is
-    g over the penalty. The weight is reduced by half a decade at most, the distance of the weights
-    tried: a larger disagreement is due to errors of the model. The steps end before a weight at
-    which the fit does not converge.
+    At the minimum with a weight w that agrees with the data, w times the penalty is the number of
+    parameters that the data determine, g = d - trace(w H C / 2) of d free ones (MacKay, 1992,
+    Bayesian interpolation, section 4). If it is more, or less than half, as far from the centre the
+    penalty is not quadratic, the next weight is g over the penalty. It is at least half a decade
+    below the given one (a larger disagreement is due to errors of the model), and one at which the
+    fit converges.
     """
     programme, solution, plausible = fit.programme, None, weight
     least = weight * 10.0**-_STEP
@@ -558,9 +540,9 @@ def plausible_weight(fit: Consistent, rows: Array, weight: float) -> float:
 def contradicted_extents(fit: Consistent, segments: Segments) -> tuple[str, ...]:
     """Return the bodies whose extent is contradicted by the data.
 
-    These are the bodies that are outside their box by more than four standard errors in a fit
-    without extents, at a weight of 1. That fit must also predict held-out segments better than the
-    fit with extents, by more than two standard errors and 2 % of the mean square error.
+    In a fit without extents at a weight of 1 they are outside their box by more than four standard
+    errors, and it predicts held-out segments better than the fit with extents, by more than two
+    standard errors and 2 % of the mean square error.
     """
     bounds, rows, count = fit.programme.bounds, segments.rows, len(segments.folds)
     free = replace(fit, constraints=fit.constraints.without_extent(fit.constraints.extent))
@@ -606,9 +588,8 @@ def held_out_errors(
 def log_evidence(fit: Consistent, rows: Array) -> Callable[[float], float]:
     """Return the log marginal likelihood of the data as a function of the prior's weight.
 
-    With the prior x = L (pi - centre) ~ N(0, 1 / weight) and r = A x + noise of unit variance,
-    r ~ N(0, I + A A^T / weight). The penalty is expanded at its centre; the inequalities and a
-    constant are omitted.
+    With the prior x = L (pi - centre) ~ N(0, 1 / weight), r = A x + noise of unit variance is N(0,
+    I + A A^T / weight). The penalty is expanded at its centre, without inequalities.
     """
     A, r = fit.programme.whitened(rows)
     U, s, _ = np.linalg.svd(A, full_matrices=False)
@@ -631,9 +612,9 @@ def _search(
 ) -> WeightChoice:
     """Return the largest weight that ``_is_accepted`` in comparison with that of smallest score.
 
-    ``score`` returns the score and its parts by segment and joint, or no parts. The loss is the
-    largest ratio of a joint's error to that of least squares, shape (n,); below the usual smallest
-    weight, others are tried while it is too large and decreases.
+    ``score`` returns the score and its parts by segment and joint, or none. Below the usual
+    smallest weight, others are tried while the largest ratio of a joint's error to that of least
+    squares (n,) is too large and decreases.
     """
     tried: dict[float, float] = {}
     parts: dict[float, Array] = {}
@@ -673,8 +654,8 @@ def _search(
 def _is_accepted(parts: Array, best: Array, allowed: float) -> bool:
     """Return whether errors are about as small as the best ones, both of shape (segments, n).
 
-    The RMS error over segments, its geometric mean over joints, is at most 2 % larger, and that of
-    any joint 5 %. The mean log ratio by segment is at most the allowed one, or two standard errors.
+    The RMS error, its geometric mean over joints, is at most 2 % larger, and that of any joint 5 %.
+    The mean log ratio by segment is at most the allowed one, or two standard errors.
     """
     if not parts.size:
         return False

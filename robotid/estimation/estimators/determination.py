@@ -1,7 +1,6 @@
 """Identifiability of base parameters: individually, only in sums with others, or not at all.
 
-One criterion is used everywhere: a direction in the space of base parameters is identifiable if the
-data reduce its standard deviation in comparison with the prior.
+One criterion everywhere: the data reduce the standard deviation of an identifiable direction.
 """
 
 from collections.abc import Sequence
@@ -131,14 +130,11 @@ def base_spread(K: Array, spread: Array, known: Sequence[bool] | Array = ()) -> 
 
 
 def determine(names: Sequence[str], rows: Array, spread: Array) -> Determination:
-    """Return which directions are identifiable, and the groups of parameters that are not.
+    """Return which directions rows A (k, b) identify, and the groups of parameters of the rest.
 
-    In units of the spread, the rows A have singular values s_i. Along their right singular vectors
-    the data reduce the spread to 1 / sqrt(1 + s_i^2). Directions that are hardly reduced, V_w, span
-    the space that is not identifiable. Solved for as many base parameters f, x_p = V_p V_f^-1 x_f
-    along them, so that each x_p - V_p V_f^-1 x_f is identifiable.
-
-    rows (k, b), spread (b,).
+    In units of the prior spread (b,), A has singular values s_i: along their right singular vectors
+    the spread is reduced to 1 / sqrt(1 + s_i^2). Directions V_w that are hardly reduced, solved for
+    as many base parameters f, give x_p = V_p V_f^-1 x_f: each x_p - V_p V_f^-1 x_f is identifiable.
     """
     free = np.flatnonzero(spread > 0)
     weak, shrinkage = np.zeros((len(spread), 0)), np.zeros(len(spread))

@@ -1,8 +1,4 @@
-"""The interface of estimators, their result, and standard errors from the scatter of segments.
-
-The covariance of the score of a segment, W_s^T (tau_s - W_s theta), is that of the noise, whatever
-its colour, if the segment is longer than the correlation time.
-"""
+"""The interface of estimators, their result, and standard errors from the scatter of segments."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -73,10 +69,7 @@ class Estimate:
 
     @property
     def quantile(self) -> Array:
-        """Half-width of the 95 % intervals in standard errors, Student's quantile, shape (c,).
-
-        ``details["freedom"]`` has the degrees of freedom if standard errors are from a scatter.
-        """
+        """Half-width of 95 % intervals in standard errors, of details["freedom"] if given, (c,)."""
         freedom = self.details.get("freedom", np.inf)
         return quantile(np.broadcast_to(np.asarray(freedom, dtype=float), len(self.theta)))
 
@@ -97,10 +90,9 @@ class Estimator(ABC, Generic[DataT]):
     def fit(self, data: DataT) -> Estimate:
         """Estimate the parameters from a problem in base parameters, its factors or a simulator.
 
-        Raises:
-            DataError: If there are fewer rows than parameters, or a row cannot be used.
-            RankDeficientError: If parameters are not identifiable and there is no prior.
-            NotConvergedError: If an iteration or a solver does not converge.
+        Raises:     DataError: If there are fewer rows than parameters, or a row cannot be used.
+        RankDeficientError: If parameters are not identifiable and there is no prior.
+        NotConvergedError: If an iteration or a solver does not converge.
         """
 
 
@@ -135,11 +127,7 @@ def require_rows(rows: int, columns: int, n_joints: int) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """Scatter of the scores of s segments about 0, for c parameters.
-
-    The leverages of a segment with weighted rows W are the eigenvalues of
-    L^T W^T W L = Q diag(leverage) Q^T.
-    """
+    """Scatter of the scores of s segments; (W L)^T W L = Q diag(leverage) Q^T of weighted rows."""
 
     meat: Array  # (c, c), covariance of the score W^T S^-1 (tau - W theta) of all segments
     bread: Array  # (c, c), covariance of the parameters if rows were independent
@@ -155,11 +143,10 @@ class Scatter:
         return sandwich(self.bread, self.meat)
 
     def freedom(self) -> Array:
-        """Return the degrees of freedom of each parameter's variance, shape (c,), at least 1.
+        """Return each variance's degrees of freedom, (c,), at least 1; inf for that of a prior.
 
-        They are inf for parameters that no segment sees: their variance is that of a prior. Bell,
-        McCaffrey (2002), Bias reduction in standard errors for linear regression with multi-stage
-        samples, section 4.
+        Bell, McCaffrey (2002), Bias reduction in standard errors for linear regression with
+        multi-stage samples, section 4.
         """
         along = self.axes.mT @ self.root.T  # (s, c, c): column l is that of parameter l
         weight = (self.leverage * self.gain)[..., None]
@@ -179,9 +166,10 @@ class Scatter:
 def scatter(segments: Sequence[Factors], theta: Array, sigma: Array, bread: Array) -> Scatter:
     """Return the scatter of the scores of segments: theta (c,), sigma (n,), bread (c, c).
 
-    The residual of a fitted segment is smaller than its noise. It is multiplied by
-    (I - leverage)^-1/2, which is exact for independent rows (CR2). Directions that one segment
-    alone determines have no scatter; the mean scatter of all others is used for them.
+    The covariance of a score is that of the noise, whatever its colour, if the segment is longer
+    than the correlation time. The residual of a fitted segment is multiplied by (I -
+    leverage)^-1/2, which is exact for independent rows (CR2). Directions that one segment alone
+    determines have no scatter; the mean scatter of all others is used for them.
     """
     if len(segments) < FEWEST_SEGMENTS:
         raise DataError(

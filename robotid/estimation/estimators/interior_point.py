@@ -4,18 +4,14 @@
     subject to  G x + h >= 0,  N^T (x - o) = 0
 
 with the pseudo-inertias J_i(x) of the bodies and D of the drives. The log det is a barrier whose
-weight is not reduced: Z_i J_i = w 1 at the minimum, beside lambda_j s_j = 0 of the slacks
-s = G x + h. Both are followed along one central path, Z_i J_i = t 1 and lambda_j s_j = mu. In the
-coordinates z of Nesterov and Todd, J_i = R_i (diag(l_i) + z_i) R_i^T, the Hessian of the barrier
-is the identity, however thin a body is.
+weight is not reduced: Z_i J_i = w 1 at the minimum, beside lambda_j s_j = 0 of the slacks s = G x +
+h. Both are followed along one central path, Z_i J_i = t 1 and lambda_j s_j = mu. In the coordinates
+z of Nesterov and Todd, J_i = R_i (diag(l_i) + z_i) R_i^T, the Hessian of the barrier is the
+identity, however thin a body is. Several data sets are the first axis, f, of every array.
 
-Several data sets, as the folds of a cross-validation, are fitted in one pass. They are the first
-axis, f, of every array.
-
-References:
-    Nesterov, Todd (1998), Primal-dual interior-point methods for self-scaled cones; Mehrotra
-    (1992), On the implementation of a primal-dual interior point method; Colombo, Gondzio (2008),
-    Further development of multiple centrality correctors for interior point methods.
+Nesterov, Todd (1998), Primal-dual interior-point methods for self-scaled cones; Mehrotra (1992), On
+the implementation of a primal-dual interior point method; Colombo, Gondzio (2008), Further
+development of multiple centrality correctors for interior point methods.
 """
 
 from collections.abc import Sequence
@@ -124,10 +120,9 @@ class Minimum:
 class Entropic:
     """2 sum_i d(J_i || P_i) of the bodies plus |(pi - centre) / std|^2 of the drives.
 
-    d(J || P) = tr(P^-1 J) - log det(P^-1 J) - 4 is the Bregman divergence of -log det. It does not
-    depend on the frame of a body; near the prior the penalty is about |delta / std|^2. Lee,
-    Wensing, Park (2019), Geometric robot dynamic identification: a convex programming approach,
-    (22), (24), (32).
+    d(J || P) = tr(P^-1 J) - log det(P^-1 J) - 4 is the Bregman divergence of -log det, in any
+    frame; near the prior it is about |delta / std|^2. Lee, Wensing, Park (2019), Geometric robot
+    dynamic identification: a convex programming approach, (22), (24), (32).
     """
 
     centre: Array  # (p,), prior values
@@ -167,8 +162,8 @@ class Entropic:
     def root(self, pi: Array) -> Array:
         """Return S with S^T S half its second derivative at pi, shape (p, p), upper triangular.
 
-        The second derivative of a thin body is too ill conditioned to be factorised. With
-        J = L L^T it is g_kl = tr(C_k C_l), C_k = L^-1 B_k L^-T, and S is computed from C.
+        With J = L L^T it is g_kl = tr(C_k C_l), C_k = L^-1 B_k L^-T: that of a thin body is too ill
+        conditioned to be factorised.
         """
         L = np.linalg.cholesky(self.prior) @ np.linalg.cholesky(self._ratio(pi))
         C = _whitened(pseudo_inertia_basis()[None], L[:, None])  # (n, 10, 4, 4)
@@ -198,10 +193,7 @@ class Entropic:
 
 @dataclass(frozen=True, eq=False)
 class Programme:
-    """Minimise |rows [K pi; -1]|^2 + weight penalty(pi) between bounds.
-
-    The log det of the penalty is a barrier: the bodies of a minimum are physically consistent.
-    """
+    """Minimise |rows [K pi; -1]|^2 + weight penalty(pi) between bounds: bodies stay consistent."""
 
     K: Array  # (b, p), map to the base parameters
     scale: Array  # (p,), unit of each parameter: bounds and subspace are in x = pi / scale
@@ -328,7 +320,7 @@ class Programme:
     ) -> tuple[Array, list[str]]:
         """Return the distances (m, p) of fits to resampled data and prior, and failures.
 
-        Noise of the data has the covariance of their score, meat (b, b). Noise of the prior has the
+        Noise of the data has the covariance of their score, meat (b, b), that of the prior the
         covariance of the plausible prior. Both move the minimum pi (p,) of rows (k, b + 1) without
         the inequalities, with the penalty expanded at the fit; the nearest point within the bounds,
         in the metric of the fit, is the minimum with them (Bardsley, Fox, 2012, An MCMC method for
@@ -600,8 +592,8 @@ def _times(A: Array, x: Array) -> Array:
 def nearest(G: Array, h: Array, point: Array) -> Array | str:
     """Return the point with G x + h >= 0 nearest to a point (p,), or why there is none.
 
-    The shortest vector under inequalities is the residual of a problem of nonnegative least squares
-    (Lawson, Hanson, 1974, Solving least squares problems, chapter 23).
+    It is the residual of nonnegative least squares (Lawson, Hanson, 1974, Solving least squares
+    problems, chapter 23).
     """
     from scipy.optimize import nnls
 

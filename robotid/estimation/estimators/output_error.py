@@ -1,9 +1,8 @@
 """Output error method: parameters for which simulated outputs agree with measured ones.
 
-The closed loop is simulated over windows and its outputs are compared. Nothing is differentiated,
-and neither torque nor acceleration needs to be measured. The residual of a simulation is
-correlated. It is whitened by joint, e_t - rho e_(t-1); without whitening, slow drift would mask
-fast effects such as a delay.
+The closed loop is simulated over windows; torque and acceleration need not be measured. The
+residual is whitened by joint, e_t - rho e_(t-1): slow drift would mask fast effects such as a
+delay.
 """
 
 import math
@@ -96,9 +95,9 @@ class _Weights:
 class OutputError(Estimator[Simulator]):
     """Least squares of a simulator's whitened residuals, with priors and bounds.
 
-    A damped Gauss-Newton method (Levenberg, Marquardt) in rounds. Each round computes the weights
-    from the residuals, then the parameters with these weights, until both have converged. Ljung
-    (1999), System identification, 4.3 and 10.2.
+    A damped Gauss-Newton method (Levenberg, Marquardt) in rounds: the weights from the residuals,
+    then the parameters, until both have converged. Ljung (1999), System identification, 4.3 and
+    10.2.
     """
 
     reads: ClassVar[Literal["simulator"]] = "simulator"
@@ -190,10 +189,7 @@ class OutputError(Estimator[Simulator]):
         return cost if np.isfinite(cost) else np.inf
 
     def joint_step(self, simulator: Simulator, theta: Array) -> Array:
-        """Return parameters (c,) after a step together with the windows' initial states.
-
-        They do not change if the simulation after the step fails.
-        """
+        """Return theta (c,) after a step with the initial states, or as it was if that fails."""
         H, g = self.normal(simulator, self.weights(simulator, theta), theta, frees=True)
         moved = _bounded_step(H, g, theta, simulator.bounds, _CAUTIOUS)
         try:
@@ -205,8 +201,8 @@ class OutputError(Estimator[Simulator]):
     def settle(self, simulator: Simulator, estimate: Estimate) -> Estimate:
         """Return the estimate after a step of it together with the windows' initial states.
 
-        With fixed initial states the fit is biased, because these were fitted with earlier
-        parameters. The standard errors of an estimate assume free initial states.
+        With initial states fixed by earlier parameters the fit is biased, and standard errors
+        assume that they are free.
         """
         residuals = simulator.residuals(estimate.theta, with_slopes=True, with_starts=True)
         weights, theta = self._weigh(residuals, frees=True), estimate.theta
@@ -216,10 +212,9 @@ class OutputError(Estimator[Simulator]):
         return settled
 
     def moved(self, simulator: Simulator, other: Simulator, theta: Array) -> tuple[Array, Array]:
-        """Return the first-order change of an estimate for other residuals, and standard errors.
+        """Return the first-order change of an estimate for other residuals, with its errors, (c,).
 
-        The other residuals are as of a smaller integration step. Standard errors are those for
-        independent whitened residuals of ``other``; both have shape (c,).
+        Standard errors are those for independent whitened residuals of ``other``.
         """
         weights = self.weights(other, theta)
         (H, g), (_, changed) = (
@@ -236,10 +231,7 @@ class OutputError(Estimator[Simulator]):
     def normal(
         self, simulator: Simulator, weights: _Weights, theta: Array, *, frees: bool = False
     ) -> tuple[Array, Array]:
-        """Return H = A'A and A'b of the linearised problem at parameters (c,), prior included.
-
-        With ``frees`` the effect of the windows' initial states is projected out.
-        """
+        """Return H = A'A and A'b at theta (c,) with the prior; ``frees``: any initial states."""
         return _summed(simulator, theta, linearised(simulator, weights, theta, frees=frees))
 
     def _descend(
@@ -250,10 +242,7 @@ class OutputError(Estimator[Simulator]):
         residuals: Sequence[Residual],
         close: float,
     ) -> tuple[Array, Sequence[Residual], int, bool]:
-        """Minimise with fixed weights from parameters with these residuals.
-
-        Return the parameters, their residuals, the number of steps, and whether it converged.
-        """
+        """Return the minimum with fixed weights, its residuals, steps, and if it converged."""
         damping, cost = _CAUTIOUS, self._cost(simulator, weights, theta, residuals)
         if not np.isfinite(cost):
             raise NotConvergedError(
@@ -295,10 +284,7 @@ class OutputError(Estimator[Simulator]):
         *,
         moves: bool = False,
     ) -> Estimate:
-        """Return the estimate with standard errors from the scatter of the scores of segments.
-
-        If it ``moves``, it is the estimate after a step with free initial states.
-        """
+        """Return the estimate, after a step if it ``moves``; errors are from scores of segments."""
         parts = list(_whitened(residuals, weights, frees=True))
         rows = sum(r.e.size for r in residuals)
         if rows < len(theta):
@@ -374,10 +360,7 @@ def linearised(
 
 
 def segment_scores(simulator: Simulator, estimate: Estimate) -> tuple[Array, Array]:
-    """Return A'A (s, c, c) and A'b (s, c) of whitened residuals, window by window.
-
-    The effect of the windows' initial states is projected out.
-    """
+    """Return A'A (s, c, c) and A'b (s, c) of whitened residuals by window, initial states free."""
     weights = _Weights(estimate.details["correlation"], estimate.sigma)
     parts = list(linearised(simulator, weights, estimate.theta, frees=True))
     H = np.zeros((len(parts), len(estimate.theta), len(estimate.theta)))
@@ -453,8 +436,7 @@ def _segments(
 ) -> list[Factors]:
     """Return the factors of the whitened rows of c parameters, segment by segment.
 
-    With ``are_windows`` each window is about one segment: without feedback an early error persists
-    until the end of the window.
+    With ``are_windows`` a window is about one: without feedback an early error persists to its end.
     """
     total, names = sum(len(b) for _, b, _ in parts), tuple(map(str, range(c)))
     segments: list[Factors] = []

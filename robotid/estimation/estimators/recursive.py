@@ -36,10 +36,7 @@ _GAIN = 0.01  # relative decrease of the squared residual per pass at convergenc
 
 
 class RecursiveEstimator(Estimator[Problem], Generic[StateT]):
-    """Interface of recursive estimators: settings in the constructor, results in a state.
-
-    A state is an immutable dataclass of arrays and numbers.
-    """
+    """Interface of recursive estimators: settings in the constructor, an immutable state."""
 
     reads: ClassVar[Literal["samples"]] = "samples"
 
@@ -116,19 +113,16 @@ class RLSState:
 
 @dataclass(frozen=True, eq=False)
 class RLS(Filter[RLSState]):
-    """Recursive least squares with exponential forgetting.
-
-    The state is the triangular factor R of all rows. It is updated with a sample by QR:
+    """Recursive least squares with exponential forgetting: the triangular factor R of all rows.
 
         R <- triangle of [sqrt(forgetting) R; [Y tau] / sigma].
 
-    Nothing is inverted until an estimate is computed, so the update is numerically stable, and the
-    initial state has no information: without forgetting the result is that of batch least squares.
-    With forgetting, information that is not updated by motion would vanish (wind-up). Each step
-    therefore adds one row of the prior, one parameter after the other, so that the prior
-    information of each stays between forgetting^c and 1 times that of the prior. Parameters that
-    are not identifiable have infinite variance. Bierman (1977), Factorization Methods for Discrete
-    Sequential Estimation, chapter IV.
+    Nothing is inverted until an estimate is computed, and the initial state has no information:
+    without forgetting the result is that of batch least squares. With forgetting, information that
+    motion does not update would vanish (wind-up): each step adds one row of the prior, one
+    parameter after the other, so that the prior information of each stays between forgetting^c and
+    1 times that of the prior. Parameters that are not identifiable have infinite variance. Bierman
+    (1977), Factorization Methods for Discrete Sequential Estimation, chapter IV.
     """
 
     sigma: Array  # (n,), noise levels [N m or N]; only the ratios matter
@@ -218,13 +212,11 @@ class Kalman(Filter[KalmanState]):
     """Kalman filter: theta_k+1 = theta_k + w, tau = Y theta + noise.
 
     The covariance is updated in Joseph's form, P <- (1 - K Y) P (1 - K Y)^T + K R K^T, multiplied
-    out: P - A - A^T with A = K (P Y^T - K T / 2)^T and T = Y P Y^T + R. This form is as robust to
-    an inexact K, exactly symmetric, and its products have only n columns. A row with an improbable
-    innovation is rejected and counted. After 50 rejected rows in a row the next row of the joint is
-    used. A parameter with almost no information from the data is undetermined, and its standard
-    deviation is that of its prior. Bierman (1977), Factorization Methods for Discrete Sequential
-    Estimation, II; Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to
-    Tracking, 5.4.
+    out: P - A - A^T with A = K (P Y^T - K T / 2)^T and T = Y P Y^T + R, exactly symmetric, with
+    products of n columns only. A row with an improbable innovation is rejected; after 50 in a row
+    the next row of the joint is used. A parameter with almost no information is undetermined.
+    Bierman (1977), Factorization Methods for Discrete Sequential Estimation, II; Bar-Shalom, Li,
+    Kirubarajan (2001), Estimation with Applications to Tracking, 5.4.
     """
 
     sigma: Array  # (n,), noise levels [N m or N]
@@ -342,10 +334,9 @@ class DescentState:
 class Descent(RecursiveEstimator[DescentState]):
     """Base class of gradient methods: one step per sample along the gradient, in random order.
 
-    They use scaled parameters x = scale theta, for which every column has unit norm. The residual
-    is e = Psi P^ - tau, with the sign of the paper. ``fit`` reads the samples in several passes,
-    until PRX = 0. A gradient method has no estimate of its uncertainty: the covariance is infinite,
-    rank and condition number are unknown.
+    Parameters x = scale theta, for which every column has unit norm; residual e = Psi P^ - tau,
+    with the sign of the paper. ``fit`` reads the samples in several passes, until PRX = 0. The
+    covariance is infinite, rank and condition number are unknown.
     """
 
     sigma: Array  # (n,), noise level of each joint [N m or N]
@@ -443,11 +434,10 @@ class Descent(RecursiveEstimator[DescentState]):
 
 @dataclass(frozen=True, eq=False)
 class NormalisedGradient(Descent):
-    """Normalised gradient (NLMS), the fastest recursive estimator.
+    """Normalised gradient (NLMS): theta <- theta - Psi^T e / |Psi|_F^2, rows over their noise.
 
-    theta <- theta - Psi^T e / |Psi|_F^2, e = Psi theta - tau, rows in units of their noise. Without
-    noise |theta~| does not increase. Goodwin, Sin (1984), Adaptive Filtering, Prediction and
-    Control, 3.3.
+    Without noise |theta~| does not increase. Goodwin, Sin (1984), Adaptive Filtering, Prediction
+    and Control, 3.3.
     """
 
     def _moved(self, x: Array, Psi: Array, e: Array) -> Array:
@@ -458,14 +448,12 @@ class NormalisedGradient(Descent):
 class PRX(Descent):
     """The paper's update P^ <- P^ - gamma Psi^T e (24), with e = Psi P^ - tau and the exact step.
 
-    Rows are in units of their noise; gamma = e^T e / |Psi^T e|^2 is the minimiser of |P~| along the
-    direction. Without noise |P~| does not increase; with column scaling it is the norm of
-    scale * P~.
-
-    With noise each iterate changes by about the noise of its sample: on recordings of a UR10e and a
-    Panda the prediction error of the last iterate is 1.3 to 1.9 times that of weighted least
-    squares, and that of the average, the k-th iterate weighted by k^2, 1.03 to 1.05 times.
-    Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (20)-(25).
+    Rows are in units of their noise; gamma = e^T e / |Psi^T e|^2 minimises |P~| along the
+    direction, so that without noise |P~| (with scaling, scale * P~) does not increase. On
+    recordings of a UR10e and a Panda the prediction error of the last iterate is 1.3 to 1.9 times
+    that of weighted least squares, that of the average, the k-th iterate weighted by k^2, 1.03 to
+    1.05 times. Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics,
+    (20)-(25).
     """
 
     def _moved(self, x: Array, Psi: Array, e: Array) -> Array:

@@ -1,13 +1,12 @@
 """Two runs of one robot, without and with a load, for payloads and unknown drive gains.
 
 Reference run   k_j i_j = W_j beta
+
 Loaded run      k_j i_j = W_j (beta + c + D x)
 
-The difference of the runs has a known part c and an unknown part x. W D is computed from W: an
-added body has the regressor columns of the link to which it is attached. A current i_j of unknown
-gain k_j is the only noisy signal, so the equation is i_j = W_j (...) / k_j. It is bilinear and
-solved by Gauss-Newton steps, with one additional column -W_j beta per gain. Everything is computed
-from triangular factors, and all standard errors are from one covariance, which includes the gains.
+The difference of the runs has a known part c and an unknown part x; an added body has the regressor
+columns of its link. A current i_j of unknown gain k_j is the only noisy signal: i_j = W_j (...) /
+k_j is solved by Gauss-Newton steps, with one column -W_j beta per gain.
 """
 
 from collections.abc import Sequence
@@ -66,8 +65,8 @@ class TwoRuns:
 
         Standard errors are from the scatter of the scores of segments and of joints, and at least
         those for a ``share`` of independent rows. For gains see Gautier, Briot (2014), Global
-        identification of joint drive gains and dynamic parameters of robots, section 3, who use
-        total least squares.
+        identification of joint drive gains and dynamic parameters of robots, section 3 (total least
+        squares).
         """
         size, u = len(self.mean), len(self.unknown)
         gain = self._first_gains()
@@ -145,8 +144,7 @@ class TwoRuns:
     def _noise(self) -> Array:
         """Noise level of each joint's signal from separate fits of the runs, shape (n,), above 0.
 
-        If a joint moves in a few rows only, its residual is 0 whatever its noise; its RMS signal is
-        used then. Rows that are projected together have one noise level.
+        A joint that moves in a few rows only has its RMS signal, rows projected together one level.
         """
         rows, squares = np.maximum(self._logged.rows, 1), self._separate_squares
         used = np.array([len(columns) for columns in self._logged.columns])
@@ -165,10 +163,7 @@ class TwoRuns:
         return np.where(noise > 0, noise, 1.0)
 
     def _first_gains(self) -> Array:
-        """Return initial gains, shape (n,): least squares of k i - W (beta + D x) = W c.
-
-        Noise of the currents biases them slightly towards 0.
-        """
+        """Return initial gains, (n,): least squares of k i - W (beta + D x) = W c, with a bias."""
         gain = np.ones(len(self._logged.rows))
         if len(self.unknown):
             solution = self._minimum(self._both(gain, is_start=True), self._noise)[0]
@@ -228,9 +223,9 @@ class TwoRuns:
     ) -> tuple[Array, Array]:
         """Return covariance and degrees of freedom, including the uncertainty of the prior.
 
-        The scatter between segments includes errors that vary with time, that between the joints of
-        each run constant errors, as of a gain or of friction. The larger standard error is used; it
-        is at least that of independent noise, as the scatter of few parts may be too small.
+        The scatter between segments has errors that vary with time, that between the joints of each
+        run constant ones, as of a gain or of friction. The larger standard error is used, and at
+        least that of independent noise.
         """
         if len(self.reference) + len(self.loaded) < FEWEST_SEGMENTS:
             return bread, np.full(len(solution), np.inf)
@@ -277,9 +272,8 @@ def payload_runs(
 ) -> TwoRuns:
     """Return the comparison of a run without and a run with payloads.
 
-    The robot's inertias are the same in both runs. Friction and offsets of the drives differ,
-    because they change with load and temperature. Payloads are columns (b, c), known values (c,),
-    NaN for unknown ones, and their spread (c,).
+    Friction and offsets differ, as they change with load and temperature, inertias do not. Payloads
+    are columns (b, c), known values (c,), NaN for unknown ones, and their spread (c,).
     """
     columns, known, size = payloads
     changing = [not term.is_inertia for _, term in layout.drive_parameters]

@@ -73,10 +73,7 @@ class DriveChoice:
         }
 
     def moved(self, step: Array, covariance: Array) -> "DriveChoice":
-        """Return the choice with shapes changed by a step (k,), within their bounds.
-
-        No shape changes by more than a third; the covariance of the shapes (k, k) is stated.
-        """
+        """Return the choice with shapes changed by a step (k,), by at most a third, in bounds."""
         flat = np.array(list(chain.from_iterable(self.sizes)))
         families = [FAMILIES[name] for name in self.families]
         bounds = np.array([s.within(self.data_range) for family in families for s in family.shapes])
@@ -141,10 +138,7 @@ class JointMotion:
 def joint_motions(
     recordings: Sequence[Recording], rows: Sequence[Array], load: Array, model: RobotModel
 ) -> tuple[JointMotion, ...]:
-    """Return the motion of each joint and its neighbours in some rows of recordings.
-
-    load (N, n) [N m or N] over these rows of all recordings.
-    """
+    """Return the motion of each joint and its neighbours in some rows, with their load (N, n)."""
     motions = [recording.trajectory for recording in recordings]
     passes = max(recording.signals.cutoff or np.inf for recording in recordings)
     longest = max(float(np.ptp(m.t)) for m in motions) or 1.0
@@ -196,10 +190,7 @@ class OpenTerm:
 def open_torques(
     model: RobotModel, terms: Sequence[OpenTerm], recording: Recording, rows: Array
 ) -> list[Array]:
-    """Return the torque (k, n_rows) of each open term of the drives in rows (k,) of a recording.
-
-    The model has the identified bodies as its reference.
-    """
+    """Return each open term's torque (k, n_rows), of a model with the bodies as reference."""
     if not terms:
         return []
     joints, first = model.joints, model.n_rows - len(model.joints)

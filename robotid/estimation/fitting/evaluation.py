@@ -99,11 +99,7 @@ class TorqueSums:
         )
 
     def merge(self, other: "TorqueSums") -> "TorqueSums":
-        """Return the sums over the rows of both.
-
-        References:
-            Chan, Golub, LeVeque (1983), Algorithms for Computing the Sample Variance, (2.1).
-        """
+        """Return the sums over the rows of both (Chan, Golub, LeVeque, 1983, variance, (2.1))."""
         rows = self.rows + other.rows
         share = other.rows / np.maximum(rows, 1)
         step = other.mean - self.mean
@@ -238,7 +234,7 @@ def evaluate_logs(
 ) -> tuple[tuple[Evaluation, ...], tuple[Evaluation, ...]]:
     """Return the torques that parameters (p,) predict for logs, and their metrics.
 
-    The parameters of the URDF, ``prior``, and with fitted drives, ``driven``, are the baselines.
+    The URDF's parameters, ``prior``, and with fitted drives, ``driven``, are the baselines.
     """
     work = partial(_score, parameters=parameters, prior=prior, driven=driven)
     new = _score_logs(validation, work, plan)
@@ -267,10 +263,7 @@ def pool(model: RobotModel, evaluations: Sequence[Evaluation], name: str) -> Met
 
 
 def hidden_joints(model: RobotModel, evaluations: Sequence[Evaluation]) -> tuple[str, ...]:
-    """Return the joints of a static model whose gravity torque is smaller than their residual.
-
-    Stiction at rest hides small changes of the gravity torque of these joints.
-    """
+    """Return the joints of a static model whose gravity torque is less than their residual."""
     if not model.is_static or not evaluations:
         return ()
     metrics = pool(model, evaluations, "estimate").per_joint
@@ -459,8 +452,8 @@ def left_out_metrics(
 ) -> dict[str, Metrics]:
     """Return the metrics of each log as a fit to the others predicts it, by its name.
 
-    Logs that repeat the motion of one another are left out together. A fit returns the parameters
-    (p,), and those of the URDF with drives.
+    Logs that repeat a motion are left out together. A fit returns the parameters (p,), and those of
+    the URDF with drives.
     """
     if any(e.recording.is_partial for e in fitted):
         return {}

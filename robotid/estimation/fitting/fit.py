@@ -1,7 +1,7 @@
 """Fit of a robot's parameters to recordings: estimate, standard errors, predictions.
 
-The flow: rows of the recordings are reduced to factors (``_ground``), the estimator solves them
-(``_run``), and the scatter of the factors of segments gives the standard errors (``Solved``).
+Rows are reduced to factors (``_ground``), the estimator solves them (``_run``), and the scatter of
+the factors of segments gives the standard errors (``Solved``).
 """
 
 from collections.abc import Mapping, Sequence
@@ -306,14 +306,14 @@ class Solved:
 
     def _sums(self) -> RunSums | None:
         """Return the information of each log on parameters that may vary; None for few logs."""
-        ground, logs = self.ground, self.recordings
+        ground = self.ground
         if len(ground.logs) < FEWEST_RUNS:
             return None
-        sums = sums_of(logs.model, logs.mapping, ground.logs, self.standard, ground.rough.sigma)
-        noise, shift = ground.noise, np.zeros(len(logs.mapping.base_names))
+        noise, shift = ground.noise, np.zeros(len(ground.rough.theta))
         if noise is not None and noise.is_corrected:
             shift = noise.shift
-        return sums_with_zeros(sums, logs, self.standard, shift)
+        sigma = ground.rough.sigma
+        return run_sums(self.recordings, ground.logs, self.standard, sigma, shift)
 
     def _measured(self) -> tuple[Estimate, Estimate, StandardErrors]:
         """Return the estimate and that of WLS with standard errors, and how these were found."""
@@ -343,11 +343,7 @@ class Solved:
 
 
 def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Recordings:
-    """Return recordings with the joint load torque of the bodies fitted to them.
-
-    Least squares fits are iterated until the load torque has converged; the last step uses the
-    estimator itself.
-    """
+    """Return recordings with the load torque of the bodies that least squares fit to them."""
     if not is_loaded(recordings.model):
         return recordings
     choice = rough_choice(choice)
@@ -451,11 +447,9 @@ def _ground(
 
 
 def _without_regressor_noise(ground: _Ground, choice: EstimatorSettings) -> _Ground:
-    """Return the input without the bias due to position quantisation.
+    """Return the input with the bias by position quantisation, W shift, subtracted from the torque.
 
-    The term W shift is subtracted from the torque, so that every fit to the factors is corrected
-    by the shift. For estimators that read samples the bias is counted as an error. Total least
-    squares has a correction of its own.
+    For estimators that read samples the bias is counted as an error.
     """
     if choice.allows_for_noise:
         return ground
@@ -499,32 +493,30 @@ def _run(
 def sums_of_logs(
     recordings: Recordings, choice: EstimatorSettings, standard: Array, sigma: Array, shift: Array
 ) -> RunSums:
-    """Return the sums of logs that are not fitted, about the parameters of a fit to others.
-
-    standard (p,), sigma (n,) [N m or N], shift (b,).
-    """
-    model, mapping = recordings.model, recordings.mapping
+    """Return the sums of logs that are not fitted, about the parameters of a fit to others."""
     if choice.is_robust:
-        recordings, _ = reweigh(recordings, choice.loss, model.standard_parameters())
+        recordings, _ = reweigh(recordings, choice.loss, recordings.model.standard_parameters())
     logs = [
         [part.factors.without(shift) for part in parts if part.factors.rows.any()]
         for parts in recordings.reduce_logs()
     ]
-    sums = sums_of(model, mapping, logs, standard, sigma)
-    return sums_with_zeros(sums, recordings, standard, shift)
+    return run_sums(recordings, logs, standard, sigma, shift)
 
 
-def sums_with_zeros(
-    sums: RunSums, recordings: Recordings, standard: Array, shift: Array
+def run_sums(
+    recordings: Recordings,
+    logs: Sequence[Sequence[Factors]],  # segments of each log, without the shift
+    standard: Array,  # (p,)
+    sigma: Array,  # (n,) [N m or N]
+    shift: Array,  # (b,)
 ) -> RunSums:
-    """Return the sums of logs with those over the rows of the zeros of the positions.
+    """Return the sums of logs, with those over the rows of the zeros of the positions.
 
-    The torque of a log whose positions are x too large is tau(q - x) = tau(q) - d tau / dq x. Logs
-    in files, and robots with a floating base or constraints, have no such rows.
-
-    standard (p,), shift (b,).
+    A log whose positions are x too large has the torque tau(q - x) = tau(q) - d tau / dq x. Logs in
+    files, and robots with a floating base or constraints, have no such rows.
     """
     model, mapping = recordings.model, recordings.mapping
+    sums = sums_of(model, mapping, logs, standard, sigma)
     z = sum(group.kind == "zero" for group, _ in groups_at(model, mapping, standard))
     if not (z and recordings.is_in_memory):
         return sums
@@ -535,7 +527,7 @@ def sums_with_zeros(
         r, scale = np.empty((2, len(slopes)))
         for W, tau, weight in recordings.problem_of(k, motion).blocks():
             rows = slice(start, start + len(tau))
-            scale[rows] = np.sqrt(weight) / np.resize(sums.sigma, len(tau))
+            scale[rows] = np.sqrt(weight) / np.resize(sigma, len(tau))
             r[rows] = scale[rows] * (tau - W @ theta)
             start += len(tau)
         D = -scale[:, None] * slopes
@@ -549,8 +541,8 @@ def urdf_with_drives(
 ) -> Array:
     """Return the URDF's inertial parameters with fitted drive terms, shape (p,).
 
-    Weighted least squares of the drive terms d >= 0 (offsets of either sign) with the bodies' pi_I
-    as in the URDF: min sum_j |R_j K_I pi_I + R_j K_D d - tau_j|^2 / sigma_j^2.
+    Weighted least squares of drive terms d >= 0 (offsets of either sign), bodies pi_I as in the
+    URDF: min sum_j |R_j K_I pi_I + R_j K_D d - tau_j|^2 / sigma_j^2.
     """
     from scipy.optimize import lsq_linear
 

@@ -226,14 +226,38 @@ class Fit(Identified, Solution):
         Raises:
             DataError: If there is no such drive, or no speeds are given and the drive was at rest.
         """
-        return typical_friction(self, joint, v, q=q, load=load)
+        layout, d = self.model.layout, _drive_number(self, joint)
+        ratios, n = layout.drive_ratios[d], len(self.model.joints)
+        is_used = [e.recording.mask[:, -n:][:, ratios != 0.0].all(axis=1) for e in self.fitted]
+        rows, motions = np.concatenate(is_used), [e.recording.trajectory for e in self.fitted]
+        for name, value in (("q", q), ("load", load)):
+            if not (value is None or is_number(value)):
+                raise DataError(f"{name} is {str(value)[:60]!r}, wanted a finite number or None")
+        if v is None:
+            speeds = np.abs(np.concatenate([m.v[:, -n:] for m in motions])[rows] @ ratios)
+            if not speeds.any():
+                raise DataError(
+                    f"{joint} was at rest in the fitted logs, so the range of speeds is not known; "
+                    "state the speeds: friction(joint, v)"
+                )
+            side = np.linspace(speeds.min(), speeds.max(), _SPEEDS)
+            v = np.append(-side[::-1], side)
+        if q is None:  # without the pose of the base
+            positions = np.concatenate([m.q[:, -n:] for m in motions])[rows] @ ratios
+            q = float(np.median(positions)) if len(positions) else 0.0
+        if load is None:
+            load = 0.0
+            if any(term.name == "load" for term in layout.own.get(joint, ())):
+                loads = [drive_motion_along(self.model, m).load[d] for m in motions]
+                load = float(np.sqrt(np.mean(np.concatenate(loads)[rows] ** 2)))
+        speeds = real_numbers(v, "v")
+        if speeds.ndim != 1 or not np.isfinite(speeds).all():
+            raise DataError(f"v has shape {speeds.shape}, wanted finite speeds, shape (k,)")
+        return friction_curve(self, joint, speeds, q=q, load=load)
 
     @cached_property
     def is_consistent(self) -> bool:
-        """Whether every body, every drive and the mass matrix are physically consistent.
-
-        A body is checked without its links on locked joints, which keep their own inertials.
-        """
+        """Whether bodies (without links on locked joints), drives and mass matrix are physical."""
         layout = self.model.layout
         J = pseudo_inertia(self.standard[: layout.n_inertial] - held_parameters(self.model))
         are_bodies = bool((np.linalg.eigvalsh(J) > 0).all())
@@ -287,10 +311,7 @@ class Fit(Identified, Solution):
 
     @property
     def standard_quantile(self) -> Array:
-        """Half-width of each standard parameter's 95 % interval in standard errors, shape (p,).
-
-        The quantile is the largest of the base parameters that contain the parameter.
-        """
+        """Half-width of 95 % intervals, the largest of the base parameters, [std errors] (p,)."""
         quantile = np.where(self.mapping.K != 0.0, self.errors.quantile[:, None], QUANTILE)
         return np.asarray(quantile.max(axis=0))
 
@@ -331,7 +352,27 @@ class Fit(Identified, Solution):
 
     @cached_property
     def _bands(self) -> tuple[TorqueBand, ...]:
-        return recording_bands(self)
+        """The torque band of each recording from its residuals, fitted recordings first.
+
+        The noise part is chosen so that the bands contain 95 % of the torques of all recordings of
+        the same kind, fitted or validation. For validation recordings it is the prediction error on
+        new motion, and the band covers further motions as it covers these (split conformal
+        prediction, Lei et al. 2018, doi:10.1080/01621459.2017.1307116, with the parameters' part as
+        the lower bound).
+        """
+        evaluations = (*self.fitted, *self.validation)
+        is_fitted = [k < len(self.fitted) or e.is_refitted for k, e in enumerate(evaluations)]
+        bands = [
+            expected_band(self, e, None if is_own else self.between)
+            for e, is_own in zip(evaluations, is_fitted, strict=True)
+        ]
+        noise = {}
+        for kind in set(is_fitted):
+            alike = [k for k, is_own in enumerate(is_fitted) if is_own == kind]
+            parts = [bands[k] for k in alike], [evaluations[k] for k in alike]
+            noise[kind] = _residual_noise(*parts)
+        pairs = zip(bands, is_fitted, strict=True)
+        return tuple(replace(band, noise=noise[kind]) for band, kind in pairs)
 
     @cached_property
     def outliers(self) -> tuple[Outlier, ...]:
@@ -368,20 +409,14 @@ class Fit(Identified, Solution):
 
     @property
     def predictions(self) -> dict[str, Metrics]:
-        """Metrics of each validation recording without fitted rows, by its name.
-
-        Without validation recordings, those of the fitted ones that are left out in turn.
-        """
+        """Metrics of validation recordings without fitted rows, else of those left out, by name."""
         if not self.validation:
             return dict(self.left_out)
         return {e.name: e.metrics["estimate"] for e in self._unseen}
 
     @cached_property
     def overfitted(self) -> frozenset[str]:
-        """Rows of which WLS predicts every unseen recording clearly worse than the estimate.
-
-        A smaller residual of WLS on the fitted recordings then is no evidence against the estimate.
-        """
+        """Joints of which WLS predicts every unseen recording clearly worse than the estimate."""
         pairs = [[e.metrics[x].per_joint for x in ("estimate", "wls")] for e in self._unseen]
         return frozenset(
             joint
@@ -411,28 +446,6 @@ def next_errors(fit: Fit) -> Array:
     return rms_error([expected_band(fit, evaluation, fit.between) for evaluation in fit.fitted])
 
 
-def recording_bands(fit: Fit) -> tuple[TorqueBand, ...]:
-    """Return the torque band of each recording from its residuals, fitted recordings first.
-
-    The noise part is chosen so that the bands contain 95 % of the torques of all recordings of the
-    same kind, fitted or validation. For validation recordings it is the prediction error on new
-    motion, and the band covers further motions as it covers these (split conformal prediction, Lei
-    et al. 2018, doi:10.1080/01621459.2017.1307116, with the parameters' part as the lower bound).
-    """
-    evaluations = (*fit.fitted, *fit.validation)
-    is_fitted = [k < len(fit.fitted) or e.is_refitted for k, e in enumerate(evaluations)]
-    bands = [
-        expected_band(fit, e, None if is_own else fit.between)
-        for e, is_own in zip(evaluations, is_fitted, strict=True)
-    ]
-    noise = {}
-    for kind in set(is_fitted):
-        alike = [k for k, is_own in enumerate(is_fitted) if is_own == kind]
-        noise[kind] = _residual_noise([bands[k] for k in alike], [evaluations[k] for k in alike])
-    pairs = zip(bands, is_fitted, strict=True)
-    return tuple(replace(band, noise=noise[kind]) for band, kind in pairs)
-
-
 def _residual_noise(bands: Sequence[TorqueBand], evaluations: Sequence[Evaluation]) -> Array:
     """Return the noise with which bands contain 95 % of the torques, shape (n_rows,) [N m, N]."""
     noise, parts = bands[0].noise.copy(), []
@@ -446,52 +459,10 @@ def _residual_noise(bands: Sequence[TorqueBand], evaluations: Sequence[Evaluatio
     return noise
 
 
-def typical_friction(
-    fit: Fit,
-    joint: str,
-    v: ArrayLike | None = None,
-    *,
-    q: float | None = None,
-    load: float | None = None,
-) -> FrictionCurve:
-    """Return friction and offset of a drive under the conditions of the fitted logs: v (k,)."""
-    layout, d = fit.model.layout, _drive_number(fit, joint)
-    ratios, n = layout.drive_ratios[d], len(fit.model.joints)
-    is_used = [e.recording.mask[:, -n:][:, ratios != 0.0].all(axis=1) for e in fit.fitted]
-    rows, motions = np.concatenate(is_used), [e.recording.trajectory for e in fit.fitted]
-    for name, value in (("q", q), ("load", load)):
-        if not (value is None or is_number(value)):
-            raise DataError(f"{name} is {str(value)[:60]!r}, wanted a finite number or None")
-    if v is None:
-        speeds = np.abs(np.concatenate([m.v[:, -n:] for m in motions])[rows] @ ratios)
-        if not speeds.any():
-            raise DataError(
-                f"{joint} was at rest in the fitted logs, so the range of speeds is not known; "
-                "state the speeds: friction(joint, v)"
-            )
-        side = np.linspace(speeds.min(), speeds.max(), _SPEEDS)
-        v = np.append(-side[::-1], side)
-    if q is None:  # without the pose of the base
-        positions = np.concatenate([m.q[:, -n:] for m in motions])[rows] @ ratios
-        q = float(np.median(positions)) if len(positions) else 0.0
-    if load is None:
-        load = 0.0
-        if any(term.name == "load" for term in layout.own.get(joint, ())):
-            loads = [drive_motion_along(fit.model, m).load[d] for m in motions]
-            load = float(np.sqrt(np.mean(np.concatenate(loads)[rows] ** 2)))
-    speeds = real_numbers(v, "v")
-    if speeds.ndim != 1 or not np.isfinite(speeds).all():
-        raise DataError(f"v has shape {speeds.shape}, wanted finite speeds, shape (k,)")
-    return friction_curve(fit, joint, speeds, q=q, load=load)
-
-
 def friction_curve(
     fit: Fit, joint: str, v: Array, *, q: float = 0.0, load: float = 0.0
 ) -> FrictionCurve:
-    """Return friction and offset of a drive against its speed v (k,), with their band.
-
-    Friction terms with an internal state have their value after long motion in one direction.
-    """
+    """Return friction and offset against the speed v (k,), after long motion in one direction."""
     layout, d = fit.model.layout, _drive_number(fit, joint)
     none = np.zeros_like(v)
     motion = DriveMotion(q + none, v, none, np.sign(v), load + none, none)

@@ -1,8 +1,7 @@
 """The logs of a fit, of any length: surveyed once, read in pieces, and reduced to factors.
 
-The survey of a file reads the time stamps of all rows and a few windows of all columns, and
-resolves automatic settings for the whole log. A piece is a fixed range of rows, read with some rows
-before and after it. A log in memory is one piece.
+The survey of a file reads all time stamps and a few windows of all columns, and resolves automatic
+settings. A piece is a fixed range of rows; a log in memory is one piece.
 """
 
 from bisect import bisect_right
@@ -254,11 +253,7 @@ class SurveyedLog:
         return replace(self, given=self._rows_of(self.model, rows))
 
     def _rows_of(self, model: RobotModel, rows: Rows) -> Rows:
-        """Return rows with those used chosen again, now that they have torques of this robot.
-
-        Static rows were chosen by their speeds already, those of a free base without its jumps and
-        with the forces of its contacts.
-        """
+        """Return rows with those used chosen again, not of static robots and free bases."""
         if model.is_static or model.constraints or rows.trajectory.switching is not None:
             return rows
         mask = row_mask(model, rows.trajectory, self.signals.min_velocity)
@@ -365,10 +360,7 @@ def survey_log(
     *,
     length: int | None = PIECE,
 ) -> SurveyedLog:
-    """Return a surveyed log of a file.
-
-    Every time stamp is checked, units in the windows, the values of a piece when it is read.
-    """
+    """Return a surveyed log of a file, with every time stamp and units in windows checked."""
     locked = {x: layout.positions[x] for x in model.locked if x in layout.positions}
     wanted = list(dict.fromkeys([*layout.wanted, *locked.values()]))
     if length is None:

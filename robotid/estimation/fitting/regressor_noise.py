@@ -1,29 +1,21 @@
 """Bias of least squares due to encoder quantisation: errors in the variables of the regressor.
 
-A quantised position has noisy derivatives. The regressor W therefore has noise E, whose effect does
-not average out: H = W^T S^-1 W contains D = E[E^T S^-1 E], and least squares gives
-theta_ls = H^-1 (H - D) theta. The corrected estimate is theta = theta_ls + (H - D)^-1 D theta_ls.
-
-D is estimated by additional quantisation. Rounding errors e of the same encoder on the same motion,
-with a random zero of the encoder, are added to smoothed positions. They pass the same filter,
-differentiation and regressor. Terms linear in e cancel in the mean of +e and -e. With the scores
-s(theta) = W^T S^-1 (tau - W theta):
+The derivatives of a quantised position are noisy, and so is the regressor W: H = W^T S^-1 W
+contains D = E[E^T S^-1 E] of its noise E, and least squares gives theta_ls = H^-1 (H - D) theta.
+The corrected estimate is theta = theta_ls + (H - D)^-1 D theta_ls. D is estimated by rounding
+errors e of the same encoder with a random zero, added to smoothed positions. Terms linear in e
+cancel in the mean of +e and -e; with the scores s(theta) = W^T S^-1 (tau - W theta):
 
     D theta = s(theta) - mean over e of [s_{+e}(theta) + s_{-e}(theta)] / 2
 
 The eigenvalues x of D relative to H are the shares of noise in the information along the
-eigenvectors. Along each of them the correction is a factor of 1 / (1 - x), which amplifies errors
-likewise. Directions that contain only noise cannot be corrected: x is limited by a bound, and the
-error of D is counted as an error of the estimate. The bias varies over a log, so the scatter of the
-segments is also larger by about this factor (coverages: docs/explanation/intervals.md).
-
-The part linear in e, [s_{+e} - s_{-e}] / 2, is the noise of the score due to the encoder. If a
-motion repeats, so do its rounding errors, and the segments of the log scatter less than their sum.
-The difference is added to the covariance of the score.
-
-References:
-    Carroll, Ruppert, Stefanski, Crainiceanu (2006), Measurement Error in Nonlinear Models, chapters
-    5 (simulation extrapolation) and 7 (corrected scores).
+eigenvectors, where the correction is a factor of 1 / (1 - x), which amplifies errors likewise. x is
+limited by a bound, and the error of D counts as an error of the estimate (coverages:
+docs/explanation/intervals.md). The part linear in e, [s_{+e} - s_{-e}] / 2, is the noise of the
+score due to the encoder. If a motion repeats, so do its rounding errors, and segments scatter less
+than their sum: the difference is added to the covariance of the score. Carroll, Ruppert, Stefanski,
+Crainiceanu (2006), Measurement Error in Nonlinear Models, chapters 5 (simulation extrapolation) and
+7 (corrected scores).
 """
 
 from collections.abc import Sequence
@@ -124,10 +116,7 @@ def find_regressor_noise(
 
 
 def smoothed(q: Array, steps: Array, width: int) -> Array:
-    """Return the change that removes most of the quantisation of positions q, shape (N, n).
-
-    A cubic polynomial is fitted to the rows around each sample; the change is at most one step.
-    """
+    """Return the change, at most one step, of positions q (N, n) to a cubic around each sample."""
     rows = (len(q) - 1) // 2 * 2 + 1
     smooth = local_polynomial(q, min(width, rows), min(3, rows - 1))
     return np.asarray(np.clip(smooth - q, -steps, steps))
@@ -140,10 +129,7 @@ def rounding_errors(q: Array, steps: Array, rng: np.random.Generator) -> Array:
 
 
 def without_noise(bread: Array, D: Array, D_theta: Array) -> tuple[Array, Array, Array]:
-    """Return directions (b, b) in which H and D are diagonal, the move and its error (b,).
-
-    The move along them is (H - D)^-1 D theta; the bread is H^-1.
-    """
+    """Return directions (b, b) with H and D diagonal, the move (H - D)^-1 D theta and its error."""
     size, axes = np.linalg.eigh(bread)
     root = axes * np.sqrt(np.maximum(size, 0.0))
     x, rotation = np.linalg.eigh(root.T @ D @ root)
@@ -155,10 +141,8 @@ def without_noise(bread: Array, D: Array, D_theta: Array) -> tuple[Array, Array,
 def acceleration_noise(step: float, signals: SignalSettings) -> float:
     """Return the RMS acceleration due to white position noise of RMS 1 [1/s^2].
 
-    The noise passes the digital Butterworth filter, forward and backward, and two central
-    differences:
-
-    1 / (1 + (tan(pi f step) / tan(pi cutoff step))^(2 order)) and (sin(2 pi f step) / step)^2.
+    Its filters are Butterworth's, forward and backward, 1 / (1 + (tan(pi f step) / tan(pi cutoff
+    step))^(2 order)), and two central differences, (sin(2 pi f step) / step)^2.
     """
     f = (np.arange(_FREQUENCIES) + 0.5) / (2 * _FREQUENCIES * step)
     gain = (np.sin(2 * np.pi * f * step) / step) ** 2
@@ -206,10 +190,7 @@ def _shifted(log: SurveyedLog, change: Array) -> SurveyedLog:
 
 
 def _without_steps(near: Recordings, steps: Sequence[Array]) -> Recordings:
-    """Return logs in memory with most of the quantisation removed from the positions.
-
-    Added rounding errors then do not interact with those of the recorded positions.
-    """
+    """Return logs with smoothed positions, so that added rounding errors are alone."""
     logs = []
     for log, step in zip(near.fitted, steps, strict=True):
         period = 1.0 / ((log.signals.cutoff or np.inf) * log.step)  # [rows], of the filter

@@ -62,9 +62,8 @@ def loss_slope(loss: str, r: Array) -> Array:
 def reweigh(recordings: Recordings, loss: str, prior: Array) -> tuple[Recordings, float]:
     """Downweight rows with large residuals until the fit converges: prior (p,).
 
-    The scale of each joint's residual is its median absolute deviation, which outliers hardly
-    change. "tukey", which gives outliers a weight of 0, starts from the result of "huber", whose
-    minimum is unique.
+    The scale of each joint's residual is its median absolute deviation. "tukey", which gives
+    outliers a weight of 0, starts from the result of "huber", whose minimum is unique.
     """
     if not recordings.is_in_memory:
         raise SettingsError(
@@ -103,10 +102,10 @@ def find_outliers(
 ) -> tuple[Outlier, ...]:
     """Return the rows with very large residuals, the largest first: standard (p,).
 
-    Near a reversal an error of the size of the step of Coulomb friction is also accepted: during
-    stiction the friction torque can have any value between its two bounds, and a joint that stops
-    reverses in the filtered motion. A reversal is near if the filtered velocity has it within
-    1 / cutoff [s], or would have it at the sample's acceleration.
+    Near a reversal an error of the step of Coulomb friction is accepted: during stiction it can
+    have any value between its bounds, and a joint that stops reverses in the filtered motion. It is
+    near if the filtered velocity has it within 1 / cutoff [s], or would have it at the sample's
+    acceleration.
     """
     outliers: list[Outlier] = []
     step = _friction_step(model, standard)

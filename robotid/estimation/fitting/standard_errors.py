@@ -1,9 +1,7 @@
 """Standard errors for coloured noise, from the scatter of the scores of segments.
 
-Low-pass filtered residuals are correlated, and model errors are correlated over longer times, so
-rows are not independent measurements. Segments longer than the correlation time are independent:
-the covariance of the score of segment s, W_s^T (tau_s - W_s theta), is that of the noise, whatever
-its colour. It is computed from the factors of the segments, without a second pass over the rows.
+Filtered residuals and model errors are correlated, segments longer than the correlation time are
+not: the covariance of the score of segment s, W_s^T (tau_s - W_s theta), is that of the noise.
 """
 
 from collections.abc import Callable, Sequence
@@ -118,11 +116,7 @@ def measured_errors(
 
 
 def with_wls_errors(estimate: Estimate, wls: Estimate) -> Estimate:
-    """Return a gradient method's estimate with a covariance derived from weighted least squares.
-
-    A gradient method ends near the minimum of least squares. Its mean square error is the
-    covariance of that minimum plus the square of the distance to it.
-    """
+    """Return a gradient method's estimate with the errors of WLS plus its distance to it."""
     distance = estimate.theta - wls.theta
     covariance = wls.covariance + np.outer(distance, distance)
     reason = "standard errors are those of wls plus the distance to it"
@@ -201,10 +195,7 @@ class TorqueBand:
         return np.asarray(np.hypot(self.parameters, self.noise))
 
     def coverage(self, tau: Array, prediction: Array, mask: Array) -> Array:
-        """Return the share of each joint's torques in the 95 % band, shape (n_rows,) [-].
-
-        tau, prediction and mask (N, n_rows); a row that determines the band may lie on its edge.
-        """
+        """Return the share of torques (N, n_rows) in the 95 % band or on its edge, (n_rows,)."""
         used = mask[self.samples]
         error = np.abs(tau[self.samples] - prediction[self.samples])
         is_inside = (error <= (1.0 + _ROUNDING) * QUANTILE * self.total) & used
@@ -222,8 +213,8 @@ def torque_band(
 ) -> TorqueBand:
     """Return the band of predicted torques, at up to 500 samples.
 
-    Its variance is diag(W C W^T) + sum (W x + z)^2. Each pair (x, z) is an error that changes the
-    base parameters by x and, together with them, the torque by z.
+    Its variance is diag(W C W^T) + sum (W x + z)^2: an error (x, z) changes the base parameters by
+    x and, with them, the torque by z.
     """
     count = len(trajectory.t)
     samples = np.unique(np.linspace(0, count - 1, min(count, _MOST)).round().astype(int))

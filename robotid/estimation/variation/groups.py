@@ -1,10 +1,9 @@
 """Parameters that may vary between runs, and the information of each run on them.
 
-The drive terms of each drive, the gain of each joint's torque signal, and a payload on the last
-link are three kinds of groups with the same form: columns B in base parameters, and the rows that
-they act on. The torque of a run is W (theta + B x) with theta of the fit to all runs and x of the
-group in this run. The zero of each joint's position has no columns: its rows are the derivatives of
-the torque by the position. One group is estimated with the others at theta.
+Groups of the drive terms, of the gain of each joint's torque signal, and of a payload on the last
+link are columns B in base parameters, and rows: the torque of a run is W (theta + B x) with theta
+of the fit to all runs. The zero of a position has rows only: derivatives of the torque. One group
+is estimated with the others at theta.
 """
 
 from collections.abc import Mapping, Sequence
@@ -60,8 +59,8 @@ class RunsOf:
 class RunSums:
     """Sums over the rows of k runs, to which those of new runs are added.
 
-    The rows are A = W B of the Q parameters of all groups, in their order, and the residuals
-    r = tau - W theta, over the noise level of their joint. Zeros are last: see ``with_zeros``.
+    The rows are A = W B of the Q parameters of all groups, the zeros last, and residuals r = tau -
+    W theta, over the noise level of their joint.
     """
 
     H: Array  # (k, Q, Q), A^T A of each run; the blocks of the groups are used
@@ -185,10 +184,7 @@ def groups_at(
 def _products(
     segments: Sequence[Factors], groups: Sequence[Group], theta: Array, sigma: Array
 ) -> tuple[Array, Array]:
-    """Return A^T A (s, Q, Q) and A^T r (s, Q) of each segment with A = W B, r = tau - W theta.
-
-    A of a group is 0 in rows of joints that it does not act on. Rows are over their noise level.
-    """
+    """Return A^T A (s, Q, Q) and A^T r (s, Q): A = W B in a group's rows, r = tau - W theta."""
     B, sizes = np.hstack([x.columns for x in groups]), [x.columns.shape[1] for x in groups]
     acts = [np.repeat([j in group.rows for group in groups], sizes) for j in range(len(sigma))]
     H, g = np.zeros((len(segments), B.shape[1], B.shape[1])), np.zeros((len(segments), B.shape[1]))
@@ -202,10 +198,9 @@ def _products(
 
 
 def inflation_of(runs: Sequence[tuple[Array, Array]]) -> float:
-    """Return the variance of the scores of segments about each run's estimate.
+    """Return the variance of scores about each run's estimate over that of independent rows.
 
-    It is relative to that of independent rows of the stated noise level, and common to all runs: a
-    run alone has too few segments. With one segment per run it is 1.
+    It is common to all runs, as one alone has too few segments; with one segment each it is 1.
     """
     return _ratio(*_scatter(runs))
 
@@ -227,10 +222,7 @@ def _scatter(runs: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
 
 
 def _scale(group: Group, centre: Array, H: Array, model: RobotModel, standard: Array) -> Array:
-    """Return the plausible standard deviation of each parameter of a group, shape (q,).
-
-    Terms of a drive may change its torque by a tenth.
-    """
+    """Return plausible standard deviations of a group, (q,): of drives, a tenth of the torque."""
     if group.kind == "gain":
         return np.array([_GAIN])
     if group.kind == "payload":

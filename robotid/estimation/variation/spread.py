@@ -2,15 +2,12 @@
 
     x_run = mu + u_unit + u_run + e_run,    u_unit ~ N(0, s_unit^2),  u_run ~ N(0, s_run^2)
 
-A run gives the information H about the parameters of its group and h = H x_hat; H may be singular.
+A run gives the information H about the parameters of its group, possibly singular, and h = H x_hat.
 Parameters are treated one by one: the deviations of the others are integrated out of each run with
 the spread found for them, and their means add to the variance of its own. The standard deviations s
-are integrated on a grid with a half Student prior of a plausible scale: with few runs their
-uncertainty is the largest part of a prediction interval. With one unit there is one level, and the
-runs are its members.
-
-References:
-    Gelman (2006), Prior distributions for variance parameters in hierarchical models, section 2.2.
+are integrated on a grid with a half Student prior of a plausible scale. With one unit the runs are
+its members. Gelman (2006), Prior distributions for variance parameters in hierarchical models,
+section 2.2.
 """
 
 import math
@@ -138,9 +135,9 @@ class Compared:
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """One parameter for standard deviations between members and within them; sums over members.
+    """One parameter on a grid of standard deviations between members (units, or runs) and within.
 
-    Members are units, or the runs of one unit. Arrays end with the axes (within, between).
+    Arrays end with the axes (within, between).
     """
 
     between: Array  # (1, g), variance between members
@@ -300,10 +297,7 @@ class SpreadModel:
 
     @cached_property
     def values(self) -> tuple[Array, Array]:
-        """Parameters in each run and their standard errors, shapes (k, q).
-
-        They are means of the run's own estimate and of the others, weighted by information.
-        """
+        """Parameters and standard errors by run, (k, q): own estimate and others by information."""
         centre, grids = self.centred
         values, errors = zip(*(grid.values() for grid in grids), strict=True)
         return centre + np.transpose(values), np.transpose(errors)
@@ -387,8 +381,8 @@ def possible_draws(
 ) -> Array:
     """Return draws of x ~ N(0, L L^T), L (p, r), given that they are possible, shape (count, p).
 
-    Each draw is the end of its own chain of elliptical slice sampling from x = 0, which must be
-    possible (Murray, Adams, MacKay, 2010, Elliptical slice sampling, figure 2).
+    Each ends a chain of elliptical slice sampling from x = 0, which must be possible (Murray,
+    Adams, MacKay, 2010, Elliptical slice sampling, figure 2).
     """
     x = np.zeros((count, len(root)))
     for _ in range(_STEPS):
@@ -410,19 +404,13 @@ def possible_draws(
 
 
 def correlated_scores(scores: Array, share: Array, correlation: Array, drawn: Array) -> Array:
-    """Return standard normal scores of a new run: error of the fit, and deviation of the run.
-
-    z = sqrt(share) * scores + sqrt(1 - share) * w with w ~ N(0, R): scores, drawn (k, m).
-    """
+    """Return sqrt(share) * scores + sqrt(1 - share) * w, w ~ N(0, R) of a run: (k, m) scores."""
     w = drawn @ np.linalg.cholesky(correlation).T
     return np.asarray(np.sqrt(share) * scores + np.sqrt(1.0 - share) * w)
 
 
 def scores_to_values(z: Array, scores: Array, quantiles: Array, least: float) -> Array:
-    """Return the values at standard normal scores z (k,) of a predictive distribution.
-
-    Its quantiles (s,) are given at some scores (s,); no value is below the least one.
-    """
+    """Return the values at scores z (k,) of quantiles (s,) at scores (s,), none below the least."""
     slope = np.diff(quantiles) / np.diff(scores)
     if least > quantiles[0]:
         below = scipy.special.ndtr(np.interp(least, quantiles, scores))

@@ -118,8 +118,8 @@ def vary(
 ) -> Variation | None:
     """Return the variation between runs, or None for fewer than three runs.
 
-    A run is compared with the prediction of the other runs, and a unit with that of the other
-    units, group by group. If a group differs, the cause named is the group that differs most.
+    A run is compared with the prediction of the other runs, a unit with that of the other units,
+    group by group. The cause named is the group that differs most.
     """
     if len(names) < FEWEST_RUNS or not groups:
         return None
@@ -145,10 +145,7 @@ def vary(
 
 
 def between_covariance(variation: Mapping[str, Any], names: Sequence[str]) -> Array:
-    """Return the covariance (p, p) of parameters in the next run that the fit to all runs lacks.
-
-    Standard deviations are the medians of the spreads, those within units included.
-    """
+    """Return what the next run adds to the covariance (p, p), by medians of the spreads."""
     covariance = np.zeros((len(names), len(names)))
     known = [(k, name) for k, name in enumerate(variation["parameters"]) if name in names]
     varying, places = [k for k, _ in known], [list(names).index(name) for _, name in known]
@@ -162,16 +159,11 @@ def between_covariance(variation: Mapping[str, Any], names: Sequence[str]) -> Ar
 def shrunk_correlation(values: Array) -> Array:
     """Return the correlation of parameters (k, m), shrunk to 0 by its own uncertainty.
 
-    r*_ij = a_i a_j r_ij with a_i^2 = 1 - sum Var(r_ij) / sum r_ij^2 over j != i, within [0, 1]: a
-    parameter that hardly varies, and correlates by noise alone, leaves the others as they are. The
-    matrix is positive definite, as a product of positive semidefinite matrices by elements (Schur).
-    Var(r) is that of normal values, (1 - r^2)^2 / (k - 1) (Hotelling, 1953), times
-    (k^2 - 1) / (k^2 - 2 k): its mean then is right for independent parameters. Two runs determine
-    no correlation.
-
-    References:
-        Schaefer, Strimmer (2005), A shrinkage approach to large-scale covariance matrix
-        estimation, doi:10.2202/1544-6115.1175, section 2.4 (target D), there with one factor.
+    r*_ij = a_i a_j r_ij with a_i^2 = 1 - sum Var(r_ij) / sum r_ij^2 over j != i, within [0, 1], is
+    positive definite (Schur). Var(r) is that of normal values, (1 - r^2)^2 / (k - 1) (Hotelling,
+    1953), times (k^2 - 1) / (k^2 - 2 k): its mean is right for independent parameters. Two runs
+    determine none. Schaefer, Strimmer (2005), A shrinkage approach to large-scale covariance matrix
+    estimation, doi:10.2202/1544-6115.1175, section 2.4 (target D), there with one factor.
     """
     k, m = values.shape
     if k < FEWEST_RUNS:
@@ -193,9 +185,8 @@ def between_units(
 ) -> tuple[Prediction, tuple[tuple[int, float], ...]] | None:
     """Return spread and prediction of the next unit, and the units that differ from the others.
 
-    The unit farthest from the others is tested against them; if it differs, it is left out, and the
-    next one is tested. Prediction and spread are of the units that are alike. Units that differ
-    come with the two-sided probability of such a difference. values, std_errors (u,).
+    The unit farthest from the others (u,) is tested against them; if it differs, it is left out,
+    and the next one is tested. Units that differ come with the two-sided probability of that.
     """
     left, unlike = np.arange(len(values)), list[tuple[int, float]]()
     while len(left) > FEWEST_RUNS:
@@ -220,8 +211,7 @@ def between_units(
 def _probability_of_last(values: Array, std_errors: Array) -> float:
     """Return the two-sided probability of the last value without a difference from the others.
 
-    The means of both, and the logarithm of the spread, have flat priors: without standard errors
-    this is the t-test, whose level holds for any spread.
+    Means and the logarithm of the spread have flat priors: without standard errors, the t-test.
     """
     x, error = values - np.median(values), float(std_errors.min())
     low, high = (k * max(size, error) for k, size in zip(_RANGE, (0.0, np.std(x)), strict=True))
@@ -288,8 +278,7 @@ def _unlike(
 def _explained(compared: Compared, k: int, noise: float, *, is_drive: bool) -> float:
     """Return what a difference of a group explains of a run or unit: chi^2 less 2 each (Akaike).
 
-    The run's own errors are those of a common noise. Only drive terms vary between alike runs:
-    gains, payloads and zeros need a cause.
+    Errors are those of a common noise. Only drive terms vary between alike runs.
     """
     mean, std = compared.mixture.at(k).moments
     C = compared.covariance[k]
@@ -301,11 +290,10 @@ def _explained(compared: Compared, k: int, noise: float, *, is_drive: bool) -> f
 
 
 def _is_compared(group: RunsOf, which: Array, *, is_unit: bool) -> Array:
-    """Return which runs or units can be compared in a group, (m,).
+    """Return which runs or units can be compared in a group, (m,): payloads that they determine.
 
-    A payload is compared only if the run determines it: a run in which the last joints are at rest
-    has a large moment and a wrong mass in place of any other effect. What all runs together do not
-    determine, no motion does.
+    A run in which the last joints are at rest has a large moment and a wrong mass in place of any
+    other effect. What all runs together do not determine, no motion does.
     """
     runs = group.runs
     if group.group.kind != "payload":

@@ -16,11 +16,10 @@ from robotid.estimation.fitting.drive_terms import OpenTerm
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.fitted import (
+    Fit,
     expected_band,
     friction_curve,
     next_errors,
-    recording_bands,
-    typical_friction,
 )
 from robotid.estimation.fitting.standard_errors import TorqueBand, rms_error, torque_band
 from robotid.robot.drives import LoadFriction, PositionCoulomb
@@ -94,7 +93,7 @@ def test_a_validation_log_that_was_fitted_has_the_noise_of_the_fitted_ones(found
     identification, _ = found
     (kept,) = identification.validation
     again = replace(identification, validation=(replace(kept, is_refitted=True),))
-    bands = recording_bands(again)
+    bands = [again.band(e) for e in (*again.fitted, *again.validation)]
     np.testing.assert_array_equal(bands[0].noise, bands[1].noise)
     for j in range(6):  # the least that holds 95 % of the rows of both
         needed = []
@@ -105,8 +104,8 @@ def test_a_validation_log_that_was_fitted_has_the_noise_of_the_fitted_ones(found
             needed.append(((residual / 1.96) ** 2 - band.parameters[:, j] ** 2)[used])
         wanted = np.sqrt(np.quantile(np.concatenate(needed), 0.95))
         assert bands[0].noise[j] == pytest.approx(wanted)
-    apart = recording_bands(identification)
-    assert (apart[0].noise != apart[1].noise).all()
+    apart = [identification.band(e).noise for e in (*identification.fitted, kept)]
+    assert (apart[0] != apart[1]).all()
 
 
 def test_coverage_is_of_used_rows_and_a_row_on_the_edge_lies_in_the_band():
@@ -159,7 +158,7 @@ def test_usual_friction_of_a_coupled_drive_is_over_the_rows_that_all_of_its_join
     motions = [(e.recording.trajectory, r) for e, r in zip(found.fitted, rows, strict=True)]
     q, v = (np.concatenate([getattr(m, x)[r, -3:] @ ratios for m, r in motions]) for x in "qv")
     assert 10 < len(q) < 40
-    curve = typical_friction(found, "pair")
+    curve = Fit.friction(found, "pair")
     side = np.linspace(np.abs(v).min(), np.abs(v).max(), 20)
     np.testing.assert_allclose(curve.v, [*-side[::-1], *side], rtol=1e-12)
     names = [f"pair.{x}" for x in ("viscous", "coulomb", "coulomb_q1")]
@@ -172,11 +171,11 @@ def test_usual_friction_of_a_coupled_drive_is_over_the_rows_that_all_of_its_join
     np.testing.assert_array_equal(curve.half_width, 1.96 * curve.std)
     assert curve.load == 0.0
     # of stated speeds and position
-    asked = typical_friction(found, "pair", [0.7, -0.2], q=1.1, load=3.0)
+    asked = Fit.friction(found, "pair", [0.7, -0.2], q=1.1, load=3.0)
     X = np.array([[0.7, 1.0, 0.8], [-0.2, -1.0, -0.8]])
     np.testing.assert_allclose(asked.torque, X @ found.standard[k], rtol=1e-12)
     assert asked.load == 3.0
-    assert repr(typical_friction(found, "pair", [])) == "<FrictionCurve: no speeds>"
+    assert repr(Fit.friction(found, "pair", [])) == "<FrictionCurve: no speeds>"
 
 
 def test_usual_friction_that_depends_on_the_load_is_that_at_its_rms_over_the_rows_used(rng):
@@ -186,7 +185,7 @@ def test_usual_friction_that_depends_on_the_load_is_that_at_its_rms_over_the_row
         m = e.recording.trajectory
         bodies = joint_torque_regressor(found.model, m.q, m.v, m.a)[:, :size]
         loads.append((bodies @ found.standard[:size]).reshape(-1, 3)[e.recording.mask[:, 1], 1])
-    curve = typical_friction(found, ELBOW, [0.4])
+    curve = Fit.friction(found, ELBOW, [0.4])
     assert curve.load == pytest.approx(np.sqrt(np.mean(np.concatenate(loads) ** 2)))
     for wrong, words in (
         ({"load": np.inf}, "load is 'inf', wanted a finite number or None"),
@@ -196,11 +195,11 @@ def test_usual_friction_that_depends_on_the_load_is_that_at_its_rms_over_the_row
         ({"joint": "elbow"}, r"'elbow' is no drive of .*; drives: .*pair"),
     ):
         with pytest.raises(DataError, match=words):
-            typical_friction(found, **{"joint": ELBOW, "v": [0.1], **wrong})
+            Fit.friction(found, **{"joint": ELBOW, "v": [0.1], **wrong})
     for e in found.fitted:
         e.recording.trajectory = replace(e.recording.trajectory, v=0.0 * e.recording.trajectory.v)
     with pytest.raises(DataError, match="elbow_joint was at rest in the fitted logs, so the range"):
-        typical_friction(found, ELBOW)
+        Fit.friction(found, ELBOW)
 
 
 def test_a_term_that_is_open_adds_its_own_torque_to_what_it_moves(rng):

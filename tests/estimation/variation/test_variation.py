@@ -9,7 +9,7 @@ from helpers.synthetic import truth
 
 from robotid.diagnosis.verdict.fit_findings import unlike_findings
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.estimation.fitting.fit import solve_recordings, sums_with_zeros
+from robotid.estimation.fitting.fit import run_sums, solve_recordings
 from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.estimation.variation.groups import (
     Group,
@@ -98,7 +98,7 @@ def test_rows_of_zeros_are_differences_of_the_torque(model):
         for k, log in enumerate(own.fitted)
     ]
     plain = sums_of(model, own.mapping, segments, base, sigma)
-    found = sums_with_zeros(plain, own, base, shift)
+    found = run_sums(own, segments, base, sigma, shift)
     groups = [group for group, _ in groups_at(model, own.mapping, base)]
     assert [(g.name, g.units) for g in groups[-3:]] == [(j, ("rad",)) for j in model.joints]
     h, parts = 1e-6, [[] for _ in model.joints]
