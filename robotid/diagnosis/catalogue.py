@@ -45,8 +45,7 @@ def finding(
     **values: float | str,
 ) -> Finding:
     """Return a finding: of a log and joints, or at another subject."""
-    # Values are figures, words, or the choice of a part of the sentence. Behind a colon, the code
-    # has the name of another sentence.
+    # Values are figures, words, or choices of parts; behind a colon is another sentence.
     entry, code = entries()[code], code.partition(":")[0]
     joints = (joints,) if isinstance(joints, str) else tuple(joints)
     about = subject or ", ".join(joints)

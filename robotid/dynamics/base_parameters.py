@@ -1,7 +1,6 @@
 """Base parameters: the combinations of the standard parameters that affect the torque.
 
-QR with column pivoting of the regressor at random states: W P = Q [R1 R2], so the dependent columns
-are combinations of the independent ones, W_2 = W_1 R1^-1 R2, and W pi = W_1 beta with
+By QR with column pivoting of the regressor at random states, W P = Q [R1 R2]: W pi = W_1 beta with
 beta = K pi = pi_1 + R1^-1 R2 pi_2 (Gautier 1991).
 """
 
@@ -92,17 +91,13 @@ def base_mapping(
     preference: Array | None = None,
     rtol: float = RANK_TOLERANCE,
 ) -> BaseMapping:
-    """Return the base parameters of a regressor taken at random states (Gautier 1991).
-
-    The columns are compared after multiplication by ``scales``, physical magnitudes. They are not
-    normalised, since a column of rounding errors would become a parameter.
-    """
+    """Return the base parameters of a regressor at random states; scales: physical magnitudes."""
     if W.ndim != 2 or W.shape[1] != len(names) or len(W) < len(names):
         raise DataError(f"W has shape {W.shape}, wanted at least {len(names)} rows of {len(names)}")
     if not np.isfinite(W).all() or not W.any():
         raise DataError("W is all zero or not finite, wanted finite numbers")
     magnitude = np.ones(len(names)) if scales is None else scales
-    R = triangle_of(W) * magnitude
+    R = triangle_of(W) * magnitude  # normalised, a column of rounding errors would count
     order, pivots = _pivot(R)
     rank = int(np.sum(pivots > rtol * pivots[0]))
     order = order if preference is None else _pivot(R * preference)[0]
@@ -117,12 +112,8 @@ def base_mapping(
 
 
 def _pivot(R: Array) -> tuple[Array, Array]:
-    """Return the order in which columns are chosen and the pivot of each, descending.
-
-    LAPACK's QR with column pivoting chooses the remaining column with the largest norm; later
-    columns are slightly shortened, so that of equal ones the first is chosen despite rounding.
-    """
-    shortened = R * (1.0 - _TIE * np.arange(R.shape[1]))
+    """Return the order in which columns are chosen, by norm, and the pivot of each, descending."""
+    shortened = R * (1.0 - _TIE * np.arange(R.shape[1]))  # the first of equal ones is chosen
     triangle, order = scipy.linalg.qr(shortened, mode="r", pivoting=True)
     return order, np.abs(np.diag(triangle))
 
@@ -139,11 +130,7 @@ def _expression(row: Array, names: tuple[str, ...], first: int) -> str:
 def structural_mapping(
     model: RobotModel, *, inertial_only: bool = False, plain: BaseMapping | None = None
 ) -> BaseMapping:
-    """Return the structural base parameters of a robot, always the same for one robot.
-
-    Further terms of single drives do not change the base parameters without them. They add new
-    ones, or are added to existing sums, for example a torque with the period of gravity.
-    """
+    """Return the structural base parameters of a robot; further terms only add to those without."""
     columns = model.layout.n_inertial if inertial_only else len(model.layout.names)
     if model.layout.own and not inertial_only:
         return _with_own_terms(model, plain or structural_mapping(model.with_terms({})))

@@ -1,9 +1,8 @@
 """Elimination of unknown constraint forces: contacts with the ground and closed chains.
 
-With the Jacobian J of the constraints, W pi = tau + J^T f with the forces f. The rows are
-projected orthogonally to the columns of J^T of unknown forces, P W pi = P tau with P = I - B B^T
-and B an orthonormal basis of these columns. The forces disappear, and as many equations as they
-have components. A force of 1 N counts as much as a torque of 1 N m.
+W pi = tau + J^T f with the Jacobian J of the constraints and forces f. With an orthonormal basis B
+of the columns of J^T of unknown forces and P = I - B B^T, P W pi = P tau: the forces disappear, and
+as many equations as they have components. A force of 1 N counts as much as a torque of 1 N m.
 
 Shapes: q (N, n), J (N, m, n_rows), contacts (N, k) and used (N, n_rows) bool, B (N, n_rows, r).
 """
@@ -26,7 +25,7 @@ from robotid.robot.constraints import Contact, frame_id
 from robotid.robot.model import RobotModel
 
 _RANK = 1e-8  # singular values below this share of the largest are of dependent constraints ...
-_WEAK = 0.01  # ... if rows of the base alone are used, which feet of equal height hardly load
+_WEAK = 0.01  # ... in rows of the base alone, which feet that press against each other hardly load
 _AS_IS = BaseSource()
 _BLOCK = 1024  # samples whose Jacobians are in memory together
 _CACHED = 64  # samples that are projected together
@@ -66,12 +65,7 @@ def contact_links(model: RobotModel, q: Array) -> tuple[Array, Array]:
 
 
 def force_basis(J: Array, used: Array, floats: bool = False) -> Array:
-    """Return orthonormal bases B of the torques that unknown constraint forces can cause.
-
-    Two feet that press against each other hardly load the base: by their difference in height, if
-    their vertical forces are known. In the rows of a floating base alone, forces that would have to
-    be a hundred times larger than others for an effect of the same size are taken to have none.
-    """
+    """Return orthonormal bases B of the torques that unknown constraint forces can cause."""
     A = J.swapaxes(1, 2) * used[:, :, None]
     parts, least = [], _least(used, floats)
     for start in range(0, len(A), _BLOCK):
@@ -107,11 +101,7 @@ def mixed_rows(basis: Array, weights: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ProjectedRows(RowSource):
-    """Rows of a trajectory without the torques of its constraint forces; see ``RowSource``.
-
-    Every used row has the columns of all rows; a row with weight 0 in all samples has none. The
-    count of rows is that of independent equations, the sum of the diagonal of P.
-    """
+    """Rows without constraint forces: each has the columns of all rows, or none without weight."""
 
     own: RowSource  # the rows before the projection, not weighted
     basis: Array  # as of ``force_basis``
@@ -136,7 +126,7 @@ class ProjectedRows(RowSource):
 
     def rows(self, start: int, stop: int) -> Array:
         B = self.basis[start:stop]
-        left = 1.0 - np.einsum("kij,kij->ki", B, B)  # (k, n_rows), diagonal of P
+        left = 1.0 - np.einsum("kij,kij->ki", B, B)  # (k, n_rows), diagonal of P: its trace counts
         count: Array = np.rint(np.sum(left, axis=0, where=self.weights[start:stop] > 0))
         return count.astype(int)
 
@@ -172,11 +162,7 @@ class ProjectedRows(RowSource):
 def constrained(
     model: RobotModel, motion: Trajectory, used: Array, *, has_torque: bool = True
 ) -> tuple[Trajectory, Array]:
-    """Return a motion with torques without those of constraint forces, and the rows used.
-
-    Torques of measured forces are subtracted, those of unknown forces are eliminated. Rows in which
-    nothing remains, and samples at which a contact changes or the base jumps, are not used.
-    """
+    """Return a motion without measured forces (subtracted) and unknown ones, and the rows used."""
     if not has_torque:
         used = used & (np.arange(model.n_rows) < model.n_rows - len(model.joints))
     if motion.switching is not None:
@@ -192,7 +178,7 @@ def constrained(
             tau[k] += np.einsum("kmj,km->kj", J[:, known], motion.wrenches[k])
         parts.append(force_basis(np.delete(J, known, axis=1), used[k], floats))
     basis = np.concatenate(parts)
-    used = used & (np.sum(basis**2, axis=2) < 1.0 - _RANK)
+    used = used & (np.sum(basis**2, axis=2) < 1.0 - _RANK)  # rows in which something remains
     return replace(motion, basis=basis, tau=without_forces(basis, tau), loaded=tau), used
 
 

@@ -1,12 +1,9 @@
 """The compressed problem: one triangular factor per joint, by sequential QR.
 
-Least squares, weighted least squares and convex fits need only the triangular factor R_j of each
-joint's rows, with R_j^T R_j = [W_j tau_j]^T [W_j tau_j]. The factors of two logs merge into the
-factor of both. A reduction of a segment of a log has its factors and other sums over its samples.
-
-Rows are folded into a factor in place by LAPACK's dtpqrt, which computes the QR of [R; rows]
-without using the zeros of R. It is called through the address of SciPy's own LAPACK, which copies
-nothing and releases the interpreter's lock; if that is not available, through SciPy's wrapper.
+Fits need only the triangular factor R_j of each joint's rows, with R_j^T R_j =
+[W_j tau_j]^T [W_j tau_j]; those of two logs merge. Rows are folded in place by LAPACK's dtpqrt, the
+QR of [R; rows] without the zeros of R, through the address of SciPy's own LAPACK: it copies nothing
+and releases the interpreter's lock. If that is not available, SciPy's wrapper is used.
 """
 
 import ctypes
@@ -143,11 +140,9 @@ class Reduction:
 
 
 def compress(problem: Problem, *, threads: int | None = None) -> Factors:
-    """Fold a problem into its factors, block by block.
+    """Fold a problem into its factors, in parts of a fixed size, whatever the number of threads.
 
-    Long problems are cut into parts of a fixed number of samples, whose factors are merged in
-    order: the result does not depend on the number of threads. See Demmel, Grigori, Hoemmen, Langou
-    (2012), Communication-optimal parallel and sequential QR.
+    See Demmel, Grigori, Hoemmen, Langou (2012), Communication-optimal parallel and sequential QR.
     """
     columns = [np.flatnonzero(row) for row in problem.support]
     triangles = [Triangle(len(own) + 1) for own in columns]

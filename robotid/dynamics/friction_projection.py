@@ -1,8 +1,7 @@
 """Projection of drive friction on the terms of simulators: viscous, Coulomb, spring, offset.
 
-A drive's torque X x of all its terms is replaced by Y z of the terms of a format, the nearest to
-X x in least squares over the rows of the logs. This needs only the mean products of the columns of
-X and Y over the rows. A result contains them, so that the logs are not needed.
+A drive's torque X x is replaced by Y z of the terms of a format, the nearest in least squares over
+the rows of the logs. A result has the mean products of the columns of X and Y, without the logs.
 """
 
 import warnings
@@ -116,10 +115,7 @@ class Projection:
 def drive_moments(
     model: RobotModel, recordings: Iterable[tuple[Trajectory, Array]]
 ) -> dict[str, DriveMoments]:
-    """Return the moments of the drives with further terms, by name: recordings (N, n_rows).
-
-    Friction is that of ``predict``: internal states are at their steady value, without a delay.
-    """
+    """Return the moments of the drives with further terms, at steady internal states, by name."""
     layout, n = model.layout, len(model.joints)
     sums: dict[str, tuple[tuple[str, ...], Array, float, int]] = {}
     for trajectory, mask in recordings if layout.own else ():
@@ -155,8 +151,7 @@ def project_friction(
 ) -> Projection:
     """Return a robot whose drives have only the terms of a format, by least squares.
 
-    Drives whose terms the format has are unchanged. So are inertia and, in a format without them,
-    offsets. Viscous and Coulomb friction and a spring are not negative.
+    Inertia, and offsets in a format without them, are unchanged; other terms are not negative.
     """
     layout, projected = model.layout, []
     for d, drive in enumerate(layout.drives):

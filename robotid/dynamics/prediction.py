@@ -55,8 +55,7 @@ def predict(
 ) -> list[Array]:
     """Return the torque W theta, (N, n_rows) [N m, N], of several vectors; constrained: P W theta.
 
-    It is computed by the rows of the regressor for all vectors together, or, if the rows are not
-    compiled and the vectors are few, by inverse dynamics, once per vector (Luh, Walker, Paul 1980).
+    By rows for all together, or, not compiled and few, by inverse dynamics for each (Luh 1980).
     """
     source = trajectory_rows(model, trajectory, None, compiled)
     stacked = np.column_stack(list(parameters))
@@ -79,12 +78,10 @@ def predict_instants(
     v: ArrayLike | None = None,
     a: ArrayLike | None = None,
 ) -> Array:
-    """Return the torques predicted from parameters at independent samples, (n_rows,) [N m, N].
+    """Return the torques at independent samples, (n_rows,) or (N, n_rows) [N m, N].
 
-    Friction has the sign of the speed: at rest, where it can have any value within its limits, it
-    counts as 0. Internal states of friction are at their steady value, under the torque of the
-    bodies, and there is no delay. Velocities and accelerations of a robot whose ``dynamics`` is
-    "static" affect only the sign of friction.
+    Friction is 0 at rest. Internal states have their steady value under the torque of the bodies,
+    and there is no delay. Of a static robot, v affects only the sign of friction.
     """
     q = real_numbers(q, "q")
     wanted = (*q.shape[:-1], model.n_rows)
@@ -120,11 +117,7 @@ def predict_instants(
 
 
 def rigid_parts(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> list[Array]:
-    """Return gravity, inertia and velocity torques of the bodies, each (N, n_rows) [N m, N].
-
-    They are g(q) = tau(q, 0, 0), M(q) a = tau(q, 0, a) - g(q) and C(q, v) v = tau(q, v, a) -
-    tau(q, 0, a). Their sum is the torque of the bodies.
-    """
+    """Return gravity, inertia and velocity torques g, M a, C v of the bodies, (N, n_rows) each."""
     still = np.zeros_like(v)
     states = ((still, still), (still, a), (v, a))
     g, g_and_Ma, total = (_bodies_torque(model, pi, q, *x) for x in states)
@@ -156,10 +149,7 @@ def _from_kept(source: TrajectoryRows, inertial: InertialRows, stacked: Array) -
 
 
 def _has_centres(model: RobotModel, pi: Array) -> bool:
-    """Return whether Pinocchio's (m, c, I about c) represents every body without loss of digits.
-
-    Base parameters have first moments without a mass; a consistent body has |m c|^2 <= m tr I / 2.
-    """
+    """Return whether Pinocchio's (m, c, I) keeps the digits; consistent: |m c|^2 <= m tr I / 2."""
     bodies = pi[: model.layout.n_inertial].reshape(-1, 10)
     moments = np.sum(bodies[:, 1:4] ** 2, axis=1)
     return bool((moments <= bodies[:, 0] * bodies[:, [4, 6, 9]].sum(axis=1)).all())
@@ -312,11 +302,7 @@ def remember(model: RobotModel, trajectory: Trajectory) -> Trajectory:
 def drive_motion_along(
     model: RobotModel, trajectory: Trajectory, *, has_rate: bool = True
 ) -> DriveMotion:
-    """Return the motion and load of the drives of a robot along a trajectory, (d, N).
-
-    The load is the torque of the bodies, and the rate that of the whole torque, by the model's
-    reference; a delayed torque itself is not included.
-    """
+    """Return motion, load (of bodies) and rate (of all torques) of the drives, (d, N), cached."""
     key, known = (model.pin_model, model.layout, has_rate), trajectory.derived.get("drive motion")
     if known is None or known[0] != key or not np.array_equal(known[1], model.carried_by):
         moved = _drive_motion(model, trajectory, has_rate)

@@ -1,13 +1,11 @@
 """Logs as a robot needs them, completed by closed chains and contacts, and the rows that are used.
 
-The force f of each contact that a log does not state is the least-squares solution of
-J^T f = W pi - tau with the bodies of the URDF, over the rows of base and joints. A link that
-touches the ground has a force upwards, is low and hardly moves. The three are values of two normal
-distributions, with and without contact, whose parameters are those of the log.
+The force f of a contact that a log does not state is the least-squares solution of
+J^T f = W pi - tau with the URDF's bodies. A link on the ground has a force upwards, is low and
+hardly moves: values of two normal distributions, with and without contact, estimated from the log.
 
-Measured and differentiated velocities are compared by their torque prediction errors: the torque of
-each joint is fitted separately with either on every other part of the log, and predicted on the
-other parts.
+Measured and differentiated velocities are compared by the error of each joint's torque on every
+other part of the log, predicted by a fit to the other parts.
 """
 
 import logging
@@ -44,11 +42,7 @@ _COMPUTED = 1e-5  # ... at computed ones
 
 
 def closed_log(model: RobotModel, log: Log) -> Log:
-    """Return the log of all joints of a robot, with positions of passive joints from its loops.
-
-    The torques of passive joints are 0. Velocities, accelerations and commands of a log without the
-    position of a passive joint are not used. The pose of the base becomes that of the root link.
-    """
+    """Return the log of all joints, passive ones from the loops, and the pose of the root link."""
     if model.passive or model.loops:
         log = _with_passive(model, log)
     if log.base is None or not log.base.link:
@@ -161,10 +155,7 @@ def with_contacts(model: RobotModel, log: Log, signals: SignalSettings) -> Log:
 def find_contacts(
     model: RobotModel, log: Log, signals: SignalSettings
 ) -> tuple[Array, list[str], Array, Array]:
-    """Return times (N,) [s] and the contacts of a robot that its log does not state.
-
-    The k links, the probability that each touches the ground, and its force upwards [N], (N, k).
-    """
+    """Return times (N,), unstated links, their probabilities of contact and forces (N, k) [N]."""
     wanted = [x for x in model.contacts if not x.always and x.frame not in log.contacts]
     if log.base is None or not log.has_torque:
         raise _unknown(log, [x.frame for x in wanted], "it has no torque or no motion of the base")
@@ -246,10 +237,8 @@ def _forces(
 def _noise_of_groups(J: Array, b: Array, size: float) -> Array:
     """Return the noise level of rows, shape (n_rows,): one for forces, moments and joints each.
 
-    The variances have the largest likelihood of the residuals (restricted maximum likelihood, by
-    Fisher scoring). Reweighting by residuals over leverages has the same solution, but with levels
-    that differ by a factor of 10 it takes tens of rounds. See Searle, Casella, McCulloch (1992),
-    Variance Components, section 8.3.
+    Restricted maximum likelihood by Fisher scoring: Searle, Casella, McCulloch (1992), Variance
+    Components, 8.3. Reweighting by residuals over leverages needs tens of rounds.
     """
     step, n = max(1, len(b) // _SAMPLES), b.shape[1]
     J, b, weak = J[::step], b[::step], np.eye(J.shape[1]) / (_WIDER * size) ** 2
@@ -329,9 +318,8 @@ def row_mask(model: RobotModel, trajectory: Trajectory, min_velocity: float) -> 
 def static_rows(model: RobotModel, log: Log, signals: SignalSettings) -> tuple[Trajectory, Array]:
     """Return the samples of a log for a static model: rest phases and slow segments, one each.
 
-    Where a joint moves, friction has its sign. Where it is at rest, friction is anywhere within its
-    limits: rest phases are used without friction, which is part of the residual then, and only for
-    joints that move in fewer samples of the log than there are rest phases.
+    At rest friction is anywhere within its limits: rest phases are used without it, and only for
+    joints that move in fewer samples than there are rest phases.
     """
     layout, n = model.layout, len(model.joints)
     unit, least = layout.drive_speeds[:n], min(signals.min_velocity, _MOVES)
@@ -368,16 +356,12 @@ def independent_share(signals: SignalSettings) -> float:
 
 
 def prefers_measured(model: RobotModel, logs: Sequence[Log], settings: SignalSettings) -> bool:
-    """Return whether velocity = "auto" uses the measured velocities of a log.
-
-    They must be fine, consistent with the positions, and predict the torque about as well as
-    differentiated ones; with too little motion for this comparison, they must not be delayed.
-    """
+    """Return whether velocity = "auto" uses the measured velocities of a log."""
     if any(coarse_velocities(log) or unlike_velocities(log) for log in logs):
         return False
     errors = np.concatenate([_errors(model, log, settings) for log in logs])
     is_known = np.isfinite(errors).all(axis=1)
-    if not is_known.any():
+    if not is_known.any():  # too little motion to compare
         return all(is_timely(log, settings.velocity_delay) for log in logs)
     ratio = float(np.median(errors[is_known, 1] / errors[is_known, 0]))
     is_better = ratio > _BETTER

@@ -402,7 +402,10 @@ class _CompiledWriter:
 
     def __init__(self, model: RobotModel, tree: Tree, plan: RowPlan, out: Array) -> None:
         self._model, self._tree, self._out = model, tree, out
-        self._places = _compiled_places(tree, plan)
+        table = np.full((len(plan.inertial), 10 * len(tree.parents)), -1)
+        for row, wanted, place in zip(table, plan.inertial, plan.places, strict=True):
+            row[wanted] = place
+        self._places = tree.places(table)
         self._ends = np.append(plan.drive_places, plan.torques)
         self._plan, self._widths = plan, np.diff(plan.first)
         self._root = np.zeros(out.shape[1])
@@ -430,14 +433,6 @@ class _CompiledWriter:
         lanes.finish_rows(
             self._values, self._ends, self._widths, self._weights, self._root, self._out, span
         )
-
-
-def _compiled_places(tree: Tree, plan: RowPlan) -> Array:
-    """Return the places of each body's columns in each of its rows, (B, D, 10); -1: none."""
-    table = np.full((len(plan.inertial), 10 * len(tree.parents)), -1)
-    for row, wanted, place in zip(table, plan.inertial, plan.places, strict=True):
-        row[wanted] = place
-    return tree.places(table)
 
 
 def _as_slice(places: Array) -> Array | slice:

@@ -43,11 +43,9 @@ def joint_torque_regressor(
 ) -> Array:
     """Return the regressor Y with tau = Y pi at each of N samples, shape (N n_rows, p).
 
-    The columns are those of the ten inertial parameters of each body, from Pinocchio, and then of
-    the drives: ``tau_j = Ia a_j + Fv v_j + Fc sign(v_j) + off``, likewise for couplings. v and a
-    have shape (N, n_rows); directions (N, c) are the signs of the speeds if None, internal states
-    (N, m) steady ones. See Atkeson, An, Hollerbach (1986), Estimation of Inertial Parameters of
-    Manipulator Loads and Links; Carpentier et al. (2019), The Pinocchio C++ library.
+    Ten inertial columns of each body (Atkeson, An, Hollerbach 1986), then those of the drives:
+    ``tau_j = Ia a_j + Fv v_j + Fc sign(v_j) + off``. v and a (N, n_rows); None: directions (N, c)
+    are the signs of the speeds, internal states (N, m) steady ones.
     """
     wanted = (len(q), model.n_rows)
     if v.shape != wanted or a.shape != wanted:
@@ -124,12 +122,7 @@ def build_problem(
     *,
     compiled: bool | None = None,
 ) -> Problem:
-    """Return the problem W pi = tau of a trajectory: a stream of row blocks with p columns.
-
-    Its blocks are computed by Pinocchio. Its rows joint by joint, which the factors need, are
-    computed by Pinocchio or by the compiled path, equal to 1e-12; ``problem.sources[0].engine`` and
-    the logger "robotid" state by which of them, and why.
-    """
+    """Return the problem W pi = tau of a trajectory: blocks by Pinocchio, rows by either engine."""
     own = trajectory_rows(model, trajectory, weight, compiled)
     weights, used = own.weights, np.any(own.weights, axis=0, keepdims=True).T
     own = replace(own, support=own.support & used)
@@ -162,10 +155,8 @@ def build_problem(
 def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) -> Array:
     """Return the regressor at random states, shape (N n_rows, p), for structural properties.
 
-    The states are scaled to the robot: speeds sqrt(g / length), accelerations g / length, so that
-    the ratio of gravity to inertia is the same for a finger and a crane. The loops of the robot are
-    closed in them, and their forces eliminated from the rows. For a static model, speeds affect
-    only the direction of friction.
+    With speeds sqrt(g / length) and accelerations g / length, gravity over inertia is the same for
+    a finger and a crane. Loops are closed, and their forces eliminated.
     """
     n = len(model.joints)
     rate = np.sqrt(9.81 / model.length)  # [1/s]
@@ -210,10 +201,7 @@ def _write_drives(
     memory: Array | None,
     Y: Array,
 ) -> None:
-    """Write the columns of the drive parameters beside those of the bodies, (N, n_rows, p).
-
-    Without ``memory``, internal states have their steady values under the torque of the bodies.
-    """
+    """Write the drives' columns beside those of the bodies, (N, n_rows, p); no memory: steady."""
     layout, size, first = model.layout, model.layout.n_inertial, model.n_rows - len(model.joints)
     signs = friction_directions(layout, v, direction)
     if memory is None and layout.remembering:

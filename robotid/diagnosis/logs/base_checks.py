@@ -29,15 +29,17 @@ from robotid.robot.model import RobotModel
 
 _MOST = 1000  # samples at which poses and forces are compared
 _MOVES = 5e-3  # [m/s] speed of feet on the ground below which they are at rest
-_SLIDES = 0.1  # [m/s] RMS speed of a foot in contact that is reported ...
-_STANDS = 0.3  # ... if it is above this share of its speed without contact, or without rolling
+# [m/s] RMS speed of a foot in contact that is reported above this share of its speed without
+# contact, or without rolling.
+_SLIDES, _STANDS = 0.1, 0.3
 _LOADED = 0.1  # of the largest measured force: a foot with more is on the ground
 _ALIKE = (0.6, 1.6)  # factors of the forces that a wrong URDF explains
 _FORCE_UNITS = {"kN": 1e3, "kgf": 9.81}
-_SLOWER = 0.65  # ratio of the speeds below which another pose is found ...
-_BETTER = 0.5  # ... and of residuals, below which other forces or another twist are
-_SIMPLER = 1.2  # a pose with another change is preferred if it reduces the speed by this ...
-_NOISE = 1e-3  # [m/s or rad/s] ... plus this; RMS from which velocities are compared
+_SLOWER, _BETTER = 0.65, 0.5  # ratio of speeds below which another pose, of residuals another
+# twist or other forces explain the motion
+# A pose with another change must reduce the speed by this factor, plus this noise [m/s or rad/s],
+# the RMS value from which velocities are compared.
+_SIMPLER, _NOISE = 1.2, 1e-3
 # of the motion or weight: difference of a wrong velocity or force, of a velocity with a cause
 _UNLIKE, _SOME = 0.3, 0.05
 _DEGREES = np.pi / 180
@@ -45,11 +47,11 @@ _UNITS = {"linear": ("mm/s", 1e-3), "angular": ("deg/s", _DEGREES)}
 _BACK = np.array([-1.0, -1.0, -1.0, 1.0])  # signs of the inverse quaternion
 _ABOVE = 0.3  # vertical distance of base and feet over their distance, from which one is above
 _ALONG = 0.8  # component of the unit vector from the feet to the base that may be the vertical
-_STRIDE = 0.2  # [s] over which the acceleration of a base is averaged against noise
-_FASTEST = 30.0  # [m/s^2] RMS of this above which its position is in mm
+# [s] over which the acceleration of a base is averaged; [m/s^2] RMS of it above which it is in mm
+_STRIDE, _FASTEST = 0.2, 30.0
 _IMU_MOVES = 0.1  # [rad/s] RMS from which angular velocities are compared
-_TILT = 8.0  # [deg] largest angle between the mean specific force and the vertical
-_SHORTEST = 2.0  # [s] in which the mean acceleration of a robot is small
+# [deg] largest angle of the mean specific force from the vertical; [s] its mean is then gravity
+_TILT, _SHORTEST = 8.0, 2.0
 
 
 def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator[Finding]:
@@ -92,7 +94,6 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
 
 def _flags(model: RobotModel, log: Log, whole: Log, t: Array) -> Array:
     """Return whether each contact of a log is in contact at times, shape (N, contacts), bool."""
-    # ``whole`` is the log with the contacts that were found.
     flags = np.ones((len(t), len(model.contacts)), dtype=bool)
     for k, contact in enumerate(model.contacts):
         if contact.is_measured:
@@ -104,8 +105,7 @@ def _flags(model: RobotModel, log: Log, whole: Log, t: Array) -> Array:
 
 def check_wrenches(model: RobotModel, log: str, motion: Trajectory) -> Iterator[Finding]:
     """Yield a finding if measured forces have another sign or unit."""
-    # With the bodies of the URDF, W pi = J^T f in the rows of a floating base, less unknown forces.
-    # The factor of f with the smallest residual is -1, or another unit.
+    # W pi = J^T f in the rows of a floating base, less unknown forces; the best factor is not 1.
     if motion.wrenches is None or not any(x.measured for x in model.contacts):
         return
     every = max(1, len(motion.t) // _MOST)
@@ -205,7 +205,7 @@ def _contact_jacobian(model: RobotModel, q: Array) -> tuple[Array, Array]:
 
 def _radius(stated: float, v: Array, rolls: Array) -> tuple[float, float, float] | None:
     """Return the radius of a foot in contact that rolls as a ball of another one than stated."""
-    # With it are the median speeds with the stated radius and with this one.
+    # With the median speeds with the stated radius and with it.
     if not rolls.any():
         return None
     # weighted median of v / roll: the smallest sum of |v - change roll|, samples that slip apart
@@ -253,8 +253,7 @@ def check_unit(log: Log) -> Iterator[Finding]:
 
 def check_twist(log: Log, signals: SignalSettings) -> Iterator[Finding]:
     """Yield a finding if the measured twist is not that of the pose, with the axes of the base."""
-    # Both pass the filter of the motion. If another reading of the quaternion explains the twist,
-    # the quaternion is wrong.
+    # Both are filtered alike; another reading of the quaternion may explain the twist.
     base = log.base
     if base is None or base.twist is None or base.imu is not None:
         return
@@ -283,8 +282,7 @@ def check_twist(log: Log, signals: SignalSettings) -> Iterator[Finding]:
         causes = {key: axes[what][key] for key in ("world", "base")}
         causes["unit"] = rms(factor * twist[:, part] - wanted[:, part])
         turned = {key: rms((twist - x)[:, part]) for key, x in readings.items()}
-        cause = min(causes | turned, key=lambda key: (causes | turned)[key])
-        best = (causes | turned)[cause]
+        best, cause = min((left, key) for key, left in (causes | turned).items())
         is_explained = best < _BETTER * off
         if size < _NOISE or off < (_SOME if is_explained else _UNLIKE) * size:
             continue
@@ -350,11 +348,9 @@ class _Feet:
 
 def check_order(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[Finding]:
     """Yield a finding if feet on the ground hardly move with another reading of the quaternion."""
-    # The slowest foot of each sample is taken to be on the ground, whatever its flags. Tried are
-    # another order of the quaternion and its inverse; the base must be above the feet. Without
-    # position the feet hardly move relative to each other. A world with another vertical axis is
-    # found, too: the base is above the feet along it. A tilt that is constant moves no foot, and is
-    # not found: it looks like a slope.
+    # The slowest foot of each sample is on the ground, whatever its flags; without position, feet
+    # hardly move relative to each other. The base is above the feet, along any axis of the world. A
+    # constant tilt moves no foot, and looks like a slope: it is not found.
     if log.base is None or not model.contacts or len(motion.t) < 3:
         return
     frames = [x.frame for x in model.contacts]
@@ -365,20 +361,13 @@ def check_order(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[Fin
     every = max(1, len(q) // _MOST)
     dx, dp = (np.gradient(y, motion.t, axis=0)[::every] for y in (x, p))
     feet = _Feet(motion.t, every, x[::every], dx, dp if log.base.has_position else None)
-    yield from _check_readings(log, feet, q, np.asarray(model.pin_model.gravity.linear))
-
-
-def _check_readings(log: Log, feet: _Feet, q: Array, gravity: Array) -> Iterator[Finding]:
-    """Yield the finding of ``check_order`` for feet and the logged quaternion (N, 4)."""
-    size = float(np.linalg.norm(gravity))
-    up = -gravity / size if size else np.zeros(3)
-    stated = feet.turned(q)
+    gravity = np.asarray(model.pin_model.gravity.linear)
+    up, stated = -gravity / (float(np.linalg.norm(gravity)) or 1.0), feet.turned(q)
     mean, speed = feet.upwards(stated[0]), feet.speed(stated)
     height, is_moving = float(mean @ up), speed >= _MOVES
     slower: list[tuple[float, float, str, str]] = []  # rank, speed, reading, gravity
-    for key, quaternion in (
-        orientation_readings(q).items() if is_moving or height <= -_ABOVE else ()
-    ):
+    tried = orientation_readings(q) if is_moving or height <= -_ABOVE else {}
+    for key, quaternion in tried.items():
         pose = feet.turned(quaternion)
         moves, direction = feet.speed(pose), feet.upwards(pose[0])
         is_above, is_slow = direction @ up >= _ABOVE, is_moving and moves < _SLOWER * speed
@@ -429,7 +418,6 @@ def check_imu(log: Log, motion: Trajectory) -> Iterator[Finding]:
 
 def _check_gyroscopes(log: Log, motion: Trajectory) -> Iterator[Finding]:
     """Yield a finding if the angular velocity is not that of the orientation."""
-    # Another reading of the quaternion, or deg/s, may explain it.
     w, place, quaternion = motion.v[:, 3:6], motion.q[:, :3], motion.q[:, 3:7]
 
     def off(x: Array, q: Array = quaternion) -> float:

@@ -21,42 +21,35 @@ from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import AGREES, BEYOND_NOISE, DIFFERS, SHARE_OF_ROWS
 from robotid.robot.parameters import ParameterLayout
 
-#: [rad/s, or m/s of a prismatic joint] slower: at rest.
-AT_REST = 0.02
-#: [rad or m] smaller range: the joint does not move.
-STATIC = 1e-3
-#: Share of the log in which a joint must move.
-MOVING = 0.1
-#: Share of its largest value, below which a torque that is never negative is 0.
-ZERO = 0.05
+AT_REST = 0.02  # [rad/s, or m/s of a prismatic joint] slower: at rest
+STATIC = 1e-3  # [rad or m] smaller range: the joint does not move
+MOVING = 0.1  # Share of the log in which a joint must move
+ZERO = 0.05  # Share of its largest value, below which a torque that is never negative is 0
 #: Largest range of a locked joint, and largest difference from its stated position [rad or m].
 STILL = 0.02
 _LEAST = {"q": 1e-3, "dq": 0.02}  # [rad or m, rad/s or m/s] smaller values: at rest
 _LEAST_TORQUE = 0.01  # share of the median joint's torque below which a torque is negligible
-_SPIKE = 15.0  # smallest distance of a spike from its neighbours, over the typical distance
-_BEYOND = 1.5  # ... and over the amplitude of the channel
-_ABSURD = 5.0  # spike over the amplitude of the channel, above which it cannot be motion
-_HARM = 0.02  # share of a channel's energy in its spikes that ruins a least-squares fit
+_SPIKE, _BEYOND = 15.0, 1.5  # distance of a spike, over the typical one and over the amplitude
+# A spike that is no motion is above this times the amplitude; with this share of the energy of its
+# channel it ruins a least-squares fit.
+_ABSURD, _HARM = 5.0, 0.02
 _NOISY = 0.3  # noise over signal from which a torque is uninformative
 _LAG = 0.002  # [s] a shorter lag is not reported
 _ALIKE = 0.8  # least correlation of a velocity with the derivative of its position
-_ENCODER = 0.01  # largest difference of a step from 2 pi / 2^bits [bits]
-_BITS = range(9, 24)  # of encoders
+_ENCODER, _BITS = 0.01, range(9, 24)  # of encoders; difference of a step from 2 pi / 2^bits [bits]
 _DEAD = 1e-3  # velocity over d(q)/dt below which the channel is constant
-_GAP = 2.5  # [median steps] a longer step is a gap
-_LONG = 0.05  # [s] ... a longer gap is a warning
-_BUNCHED = 0.2  # [median steps] a shorter step is of rows that were stamped together ...
-_CLOCK_ALIKE = 0.3  # ... if the motion per row in them is less than this share of the usual one
-_PAUSE = (
-    1.0  # [s] a longer rest at an end is reported; in a longer gap, a position that moves as in
-)
-# one step shows that the clock was set
+_GAP, _LONG = 2.5, 0.05  # [median steps] a longer step is a gap; [s] a longer one a warning
+# [median steps] A shorter step is of rows that were stamped together, if more than this share of
+# the usual motion per row is in them.
+_BUNCHED, _CLOCK_ALIKE = 0.2, 0.3
+# [s] A longer rest at an end is reported; in a longer gap, a position that moves as in one step
+# shows that the clock was set.
+_PAUSE = 1.0
 _STALE = 0.05  # share of stale rows from which they are a warning
-_CONTINUES = 0.15  # motion after repeated rows, over that in as many rows before and after it,
-_AROUND = 10  # ... estimated from at most this many rows
+# Motion after repeated rows, over that in as many rows before and after, at most so many of each.
+_CONTINUES, _AROUND = 0.15, 10
 _HARDLY = {"rad": 0.2, "m": 0.05}  # smaller range: the joint hardly moves
-_PLATEAU = 5  # consecutive rows at the limit of a clipped channel, at least
-_CLIPPED = 0.01  # share of the rows at the limit from which a channel is clipped
+_PLATEAU, _CLIPPED = 5, 0.01  # consecutive rows, and share, at the limit of a clipped channel
 _AWAY = 0.2  # of its largest value, above which a torque is not 0 any more
 _SEVERAL = 3  # torques without sign, and times that each reaches 0 and increases again, at least
 _REGULAR = 0.8  # share of holds of about one length that a quantised torque does not reach
@@ -188,8 +181,7 @@ def _velocity_scale(
     log: Log, slope: Array, v: Array, alike: Array, velocity: str
 ) -> Iterator[Finding]:
     """Yield measured velocities that are a multiple of d(q)/dt, or constant."""
-    # The factor lies between the slope of the regression of v on d(q)/dt and the inverse of the
-    # slope of the regression of d(q)/dt on v, for any noise in the two.
+    # It lies between the slopes of the regressions of v on d(q)/dt, and inverse, for any noise.
     slope, v = slope - slope.mean(axis=0), v - v.mean(axis=0)
     severity = {"differentiated": "note", "auto": "error" if log.has_torque else "warning"}
     for j, joint in enumerate(log.joints):
@@ -366,8 +358,7 @@ def _stale_rows(log: Log, step: Array) -> Iterator[Finding]:
 
 def _in_motion(log: Log, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
     """Return the runs of repeated rows within a motion that continues or catches up after them."""
-    # A robot that holds a position starts again from rest, and without further channels, a single
-    # step of the encoder is that of a slow motion.
+    # After holding a position it starts from rest; a single encoder step is that of a slow motion.
     t, q, last_row = log.t, log.q, len(log.t) - 1
     first, last = np.array([run for run in runs if run[1] < last_row], dtype=int).reshape(-1, 2).T
     n = last - first + 1
@@ -424,8 +415,7 @@ def _touches(x: Array) -> int:
 
 def _held(log: Log) -> Iterator[Finding]:
     """Yield the joints whose torque is updated less often than logged while the robot moves."""
-    # Rows that repeat in every channel are a fault of the logger and reported elsewhere; a
-    # quantised torque is constant for irregular times.
+    # Rows that repeat in every channel are a fault of the logger; quantisation repeats irregularly.
     fresh = np.append(True, (np.diff(log.q, axis=0) != 0).any(axis=1))
     lengths = np.array([_hold(x) for x in log.tau[fresh].T])
     for length in np.unique(lengths[lengths > 1]):

@@ -133,7 +133,6 @@ def check_excitation(
     signals: SignalSettings, name: str,
 ) -> Iterator[Finding]:  # fmt: skip
     """Yield which base parameters the fitted motions determine, by ``determine``."""
-    # Of long logs every n-th row is used.
     prior, step = model.standard_parameters(), -(-max(len(m.t) for m in motions) // _ROWS)
     thinned = [motion.every(step) for motion in motions]
     try:

@@ -16,32 +16,28 @@ from robotid.diagnosis.decisions import CORRELATED, DIFFERS, SHARE_OF_ROWS, SIGN
 from robotid.diagnosis.logs.channels import runs_of
 from robotid.estimation.fitting.standard_errors import QUANTILE
 
-_SECONDS = 5.0  # [s] length of the segments whose spectra are averaged
-_GAP = 5  # [median steps] a longer step ends the segment that is examined
-_COHERENT = 0.8  # least coherence of command and position at a frequency that is used
+_SECONDS, _GAP = 5.0, 5  # [s] of the averaged spectra; [median steps] a longer one ends a segment
+_COHERENT, _COHERENCE = 0.8, 0.999  # least of a frequency that is used, largest that is believed
 _EXCITED = 1e-4  # least power of a command, over that of its strongest frequency
-_LARGEST_COHERENCE = 0.999  # that is believed: joints are not linear
 _HALF_POWER = np.sqrt(0.5)  # response at the bandwidth of a loop, over the response at rest
 _RIPPLE = 5  # number of frequencies over which the size of a response is smoothed
 _DELAYS = np.arange(0.0, 0.2, 0.001)  # [s] grid of the delays
 _LONGEST = 0.5  # [s] longest delay, or lead, of the position
-_AS_ALIKE = 0.9  # share of the largest correlation that counts as equal to it
 _DETERMINED = 0.02  # [s] width of the range of delays below which a delay is determined
-_UPDATED = 1.5  # [rows] mean time between updates from which a command is zero-order held
-_MANY = 20  # values of a smooth command; rows of a constant one that is intended
+# [rows] between updates of a command that is zero-order held; values of a smooth command, and rows
+# of a constant one that is intended
+_UPDATED, _MANY = 1.5, 20
 _INTERVAL = 0.1  # [s] over which changes of commands are compared
-_FOLLOWED = 0.5  # share of slow sweeps that a joint should follow
-_STUCK = 0.2  # ... if its lag is unknown, so that it is unknown which sweeps are slow
-_SLOW = 5.0  # [lags] least duration of a slow sweep
+# Share of slow sweeps that a joint should follow: if its lag is known, and which sweeps are slow.
+_FOLLOWED, _STUCK = 0.5, 0.2
+_SLOW, _SWEEPS = 5.0, 4  # [lags] least duration of slow sweeps, and number to judge a joint by
 _RESOLVED = 10.0  # least number of encoder steps in a sweep, and of rows per period
-_SWEEPS = 4  # least number of sweeps to judge a joint by
-_SETTLED = 0.5  # [s] after its last change a command is constant
-_CONSTANT = 2.0  # [s] least total time of constant command
-_DISTURBED = 0.01  # [rad or m] motion that is allowed under a constant command
-_EXPLAINED = 0.7  # share of this motion that the other joints must explain
-_FLAT = 0.6  # least share at the largest speed, of the rows above half of it; a sine has 0.43
-_UNLIKE = 0.2  # least relative difference between this speed and the speed of the command
-_PULSES = 3  # least number of movements that end at one speed
+_SETTLED, _CONSTANT = 0.5, 2.0  # [s] after its last change a command is constant; least total time
+# [rad or m] Motion under a constant command, and share of it that the other joints must explain.
+_DISTURBED, _EXPLAINED = 0.01, 0.7
+# Movements at one speed: share of rows at it above half of it, a sine has 0.43; relative difference
+# from the speed of the command; their number.
+_FLAT, _UNLIKE, _PULSES = 0.6, 0.2, 3
 
 
 def check_commands(log: Log, prismatic: Collection[str] = ()) -> Iterator[Finding]:
@@ -58,12 +54,12 @@ def check_commands(log: Log, prismatic: Collection[str] = ()) -> Iterator[Findin
     yield from _shown(log, moved)
     yield from _held(log, moved)
     yield from _alike(log, moved)
-    early = []
-    for loop in moved:  # a joint that moves before its command
-        lag, error = loop.lag
-        if lag < -max(SIGNIFICANT * error, loop.step):
-            words = {"lag": lag, "lead": -lag, "std_error": error}
-            early.append(finding("delayed_command", log.name, loop.name, **words))
+    early = [  # a joint that moves before its command
+        finding("delayed_command", log.name, loop.name, lag=lag, lead=-lag, std_error=error)
+        for loop in moved
+        for lag, error in [loop.lag]
+        if lag < -max(SIGNIFICANT * error, loop.step)
+    ]
     clipped = dict(_saturated(log, moved))
     small = list(_small(log, [loop for loop in moved if loop.name not in clipped]))
     yield from (*early, *clipped.values(), *small)
@@ -112,8 +108,7 @@ class _Loop:
     @property
     def command(self) -> Array:
         """Commanded positions, shape (N,)."""
-        assert self.log.q_ref is not None
-        return np.asarray(self.log.q_ref[self.rows, self.joint])
+        return np.asarray(self.log.q_ref)[self.rows, self.joint]
 
     @property
     def is_commanded(self) -> bool:
@@ -123,8 +118,7 @@ class _Loop:
     @cached_property
     def response(self) -> tuple[Array, Array, Array]:
         """Frequency response from command to position: frequency [Hz], response, weight."""
-        # Only frequencies that the command excites are used. The weight is the inverse of the
-        # relative variance, from the coherence.
+        # Where the command excites it. The weight is 1 / relative variance, from the coherence.
         from scipy.signal import csd, welch
 
         n = min(len(self.q), max(8, round(_SECONDS / self.step)))
@@ -134,7 +128,7 @@ class _Loop:
         share = np.abs(both) ** 2 / np.where(command * q > 0, command * q, np.inf)
         used = (share > _COHERENT) & (command > _EXCITED * command.max()) & (f > 0)
         segments = 2 * len(self.q) / n - 1
-        share = np.minimum(share[used], _LARGEST_COHERENCE)
+        share = np.minimum(share[used], _COHERENCE)  # joints are not linear
         return f[used], both[used] / command[used], 2 * segments * share / (1 - share)
 
     @cached_property
@@ -153,8 +147,7 @@ class _Loop:
     @cached_property
     def lag(self) -> tuple[float, float]:
         """Delay of the position within the bandwidth, and its standard error [s]."""
-        # It is the lag of the largest correlation of their changes, plus the weighted mean of the
-        # remaining phase over the frequency; nan if nothing is excited.
+        # The lag of the largest correlation, plus the weighted mean of phase / frequency left.
         f, H, weight = self.response
         first = self._first_lag()
         phase = np.angle(H * np.exp(2j * np.pi * f * first))
@@ -169,8 +162,7 @@ class _Loop:
 
     def _first_lag(self) -> float:
         """Return the lag at which changes of position and command correlate most [s]."""
-        # Of several lags with about this correlation, as for a sine, it is the shortest; nan if
-        # none is positive.
+        # The shortest of lags with about this correlation, as of a sine; nan if none is positive.
         from scipy.signal import correlate
 
         alike = correlate(np.diff(self.q), np.diff(self.command), method="fft")
@@ -179,14 +171,13 @@ class _Loop:
         alike, rows = alike[within], rows[within]
         if not alike.max() > 0:
             return np.nan
-        best = rows[alike >= _AS_ALIKE * alike.max()]
+        best = rows[alike >= 0.9 * alike.max()]
         return float(best[np.argmin(np.abs(best))]) * self.step
 
     @cached_property
     def delays(self) -> tuple[float, float]:
         """The shortest and the longest pure delay that are consistent with the response [s]."""
-        # H = exp(-i w T) / (g + d i w - j w^2), in which g, d and j are linear for each T; as d is
-        # not negative, T is at most the lag.
+        # H = exp(-i w T) / (g + d i w - j w^2), linear in g, d, j for each T; T <= lag: d >= 0.
         f, H, weight = self.response
         lag, error = self.lag
         delays = _DELAYS[max(lag + 2 * error, 0.0) >= _DELAYS] if np.isfinite(lag) else _DELAYS
@@ -365,9 +356,8 @@ def _disturbed(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
         since = round(_SETTLED / loop.step)
         changed = np.append(True, np.diff(loop.command) != 0)
         last = np.maximum.accumulate(np.where(changed, np.arange(len(changed)), 0))
-        runs = [run for run in runs_of(np.arange(len(last)) - last >= since)]
-        rows = np.concatenate([np.arange(i, k) for i, k in runs] or [np.empty(0, int)])
-        if len(rows) * loop.step < _CONSTANT:
+        runs = runs_of(np.arange(len(last)) - last >= since)
+        if sum(k - i for i, k in runs) * loop.step < _CONSTANT:
             continue
         centred = np.concatenate([q[i:k] - q[i:k].mean(axis=0) for i, k in runs])
         moved, others = centred[:, loop.joint], np.delete(centred, loop.joint, axis=1)

@@ -16,36 +16,28 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process, resolve, unwrap
 from robotid.diagnosis.decisions import TINY
 from robotid.diagnosis.logs.channels import AT_REST, ZERO
-from robotid.dynamics.rows import (
-    drive_values,
-    friction_directions,
-    friction_speeds,
-    inertial_rows,
-)
+from robotid.dynamics.rows import drive_values, friction_directions, friction_speeds, inertial_rows
 from robotid.robot.model import GRAVITY, RobotModel
 
-#: Decrease of the misfit from which another gravity is reported.
-HINT = 0.7
+HINT = 0.7  # Decrease of the misfit from which another gravity is reported
 #: Ratio of unexplained shares from which another reading is certain; as decrease of the misfit.
 MUCH_BETTER = 12.0
 CERTAIN = float(np.log(MUCH_BETTER))
-#: An unexplained share below this is negligible.
-FLOOR = 1e-3
+FLOOR = 1e-3  # An unexplained share below this is negligible
 _MARGIN = 0.15  # [s] rows closer to the end of a segment are not used: the filter has not settled
 _SLOW = 0.05  # largest speed of the unknown sign of friction of a slow joint, over its largest
 _POOR = 0.08  # unexplained share from which other readings of the positions are tested
 _ROWS, _QUARTER = 200, 4  # rows of these tests, and the divisor of their number in a first pass
 _OFFSETS = (0.4, -0.4, np.pi / 2, -np.pi / 2, np.pi)  # [rad] errors of a zero position
-_ITERATIONS = 8  # of signs and fit
-_FOLDED = 0.4  # largest ratio of unexplained shares at which a torque is an absolute value
+# Iterations of signs and fit; ratio of unexplained shares up to which a torque is an absolute value
+_ITERATIONS, _FOLDED = 8, 0.4
 
 
 @dataclass(frozen=True, eq=False)
 class Probe:
     """The parts of the model's torque at N instants, linear in masses and gravity."""
 
-    # Each part is computed at first use. Whole regressors are too large: 0.3 MB per instant for 60
-    # joints.
+    # Parts are computed at first use: whole regressors have 0.3 MB per instant for 60 joints.
 
     model: RobotModel
     motion: Trajectory  # The smooth motion that contains the instants
@@ -86,11 +78,6 @@ class Probe:
         return loads
 
     @cached_property
-    def links(self) -> Array:
-        """The torque of each link on each joint by the URDF, shape (N, n, bodies)."""
-        return self._by_link(self._ten)
-
-    @cached_property
     def gravity_loads(self) -> Array:
         """Torques of links at rest, per m/s^2 of gravity in x, y, z, (3, N, n, bodies)."""
         rest = np.zeros_like(self.v)
@@ -108,11 +95,15 @@ class Probe:
         return last
 
     def loads(self, gravity: Array | None = None) -> Array:
-        """Return the torque of each link, also with another gravity, shape (N, n, bodies)."""
+        """Return the torque of each link by the URDF, shape (N, n, bodies): gravity (3,)."""
         if gravity is None:
-            return self.links
+            return self._links
         more = np.tensordot(gravity - self.gravity, self.gravity_loads, axes=1)
-        return np.asarray(self.links + more)
+        return np.asarray(self._links + more)
+
+    @cached_property
+    def _links(self) -> Array:
+        return self._by_link(self._ten)
 
     @cached_property
     def drives(self) -> Array:
@@ -160,14 +151,10 @@ def take_probe(model: RobotModel, motion: Trajectory, *, samples: int = 500) -> 
 class Explanation:
     """A hypothesis on the log, and how well the torques are explained under it."""
 
-    #: "stated", "payload", "torque_sign", "unsigned_torque", "torque_order", "gravity",
-    #: "joint_order", "joint_axis", "position_order", "position_sign" or "position_offset"
-    kind: str
+    kind: str  # "stated", "payload", or the code of its finding
     share: Array  # (n,), unexplained share of each torque's variance
     joints: tuple[int, ...] = ()  # Indices of the joints concerned
-    #: "torque_order": the joint of each torque column; "gravity": the vector [m/s^2];
-    #: "position_offset": the offset [rad]
-    values: tuple[float, ...] = ()
+    values: tuple[float, ...] = ()  # joint of each torque column, gravity [m/s^2], or offset [rad]
 
     @property
     def misfit(self) -> float:
@@ -201,11 +188,9 @@ def explanations(probe: Probe) -> tuple[Explanation, Explanation, list[Explanati
 
 def _unsigned(probe: Probe, own: Array) -> Explanation:
     """Return the hypothesis that torques that are never negative are absolute values."""
-    # The signs are those of the torque predicted from the signed torque, iterated from the signs of
-    # the URDF's torque, of the velocity or of the acceleration. The variation of the absolute value
-    # must be explained, because a constant value with the sign of the speed looks like friction.
-    # The unexplained share refers to the signed torque, because the absolute value of a torque that
-    # is mostly friction hardly varies.
+    # The signs are those of the predicted torque, iterated from those of the URDF's torque, of v or
+    # a. The variation of |tau| must be explained: a constant with the sign of the speed looks like
+    # friction. The share refers to the signed torque: |tau| that is mostly friction hardly varies.
     share, joints = own[:, 0].copy(), []
     loads = probe.loads()
     for j, tau in enumerate(probe.tau.T):
@@ -240,14 +225,12 @@ def _order(share: Array) -> Explanation:
 
     columns, joints = linear_sum_assignment(np.log(share[:, :, 0] + FLOOR))
     moved = tuple(np.flatnonzero(columns != joints).tolist())
-    values = tuple(joints.astype(float).tolist())
-    return Explanation("torque_order", share[columns, joints, 0], moved, values)
+    return Explanation("torque_order", share[columns, joints, 0], moved, tuple(joints.tolist()))
 
 
 def _gravity(probe: Probe, stated: Explanation) -> Explanation:
     """Return the direction of gravity that explains the torques best."""
-    # It is the stated one if the torques are explained, and no masses and no gravity, of any size
-    # and sign, explain them better by ``HINT``.
+    # The stated one, unless any masses and gravity explain the torques better by ``HINT``.
     from scipy.optimize import minimize
 
     size = float(np.linalg.norm(probe.gravity) or np.linalg.norm(GRAVITY))
@@ -286,9 +269,8 @@ def _gravity(probe: Probe, stated: Explanation) -> Explanation:
 
 def _shares_by_gravity(probe: Probe) -> tuple[Callable[[Array], Array], Array]:
     """Return a function of gravity (3,): the unexplained share of each torque, (n,)."""
-    # Loads are linear in gravity, so one triangular factor per joint is used for all of them.
-    # Second, the shares that all their columns leave, with factors of any sign, (n,): no gravity
-    # leaves less.
+    # Loads are linear in gravity: one triangular factor per joint. Second, the shares that no
+    # gravity and no masses of any sign reduce, (n,).
     links, size = probe.loads(), _variation(probe.tau)
     X = [links, *probe.gravity_loads, probe.drives, probe.tau[:, :, None]]
     rows = np.concatenate(X, axis=2).swapaxes(0, 1)
@@ -308,8 +290,7 @@ def _shares_by_gravity(probe: Probe) -> tuple[Callable[[Array], Array], Array]:
 
 def _positions(probe: Probe, best: float) -> Iterator[Explanation]:
     """Yield readings with another position column, sign or zero, if one is clearly better."""
-    # They are tested with few rows, first with a quarter of them: a reading without half of the
-    # required decrease there is not tested further.
+    # First with a quarter of the rows, where half of the required decrease must be reached.
     every = max(1, len(probe.rows) // _ROWS)
     some, few = (
         Probe.of(probe.model, probe.motion, probe.rows[::k]) for k in (every, _QUARTER * every)
@@ -340,7 +321,6 @@ def _revolute(probe: Probe) -> list[int]:
 
 def _exchanged(probe: Probe, pair: tuple[int, int]) -> list[Explanation]:
     """Return the readings that the positions, or all columns, of two joints are exchanged."""
-    # Each joint is tested with its own torque, and with the torque of the other joint.
     order = np.arange(len(probe.model.joints))
     order[list(pair)] = pair[::-1]
     moved = replace(probe, q=probe.q[:, order], v=probe.v[:, order], a=probe.a[:, order])

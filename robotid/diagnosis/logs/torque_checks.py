@@ -34,12 +34,10 @@ from robotid.robot.prior import payload_spread, prior_spread
 _UNEXPLAINED = 0.25  # unexplained share of a torque's variance that is reported, not accepted
 _WRONG = 0.5  # largest unexplained share of a torque with the right sign, or over that without
 # gravity, if the torque contains gravity
-_TILT = 5.0  # [deg] angle of gravity from the stated one that is a warning
-_WRONG_TILT = 30.0  # [deg] ... and an error
+_TILT, _WRONG_TILT = 5.0, 30.0  # [deg] angles of gravity from the stated one: warning and error
 _SPREAD = 0.3  # prior standard deviation of a link's mass, relative to the URDF's
 _PRECISION = 0.05  # of a torque, model errors included
-_INDEPENDENT = 20.0  # number of independent instants of a log
-_PER_SECOND = 3.0  # ... per second of a short one
+_INDEPENDENT, _PER_SECOND = 20.0, 3.0  # independent instants of a log, per second of a short one
 _MASS, _MOMENT = 20.0, 10.0  # [kg], [kg m] prior standard deviations of a payload
 _WORSE = 0.25  # allowed increase of a torque's misfit over its own fit, in variances
 _OTHER_UNIT = 30.0  # a common scale of all torques farther from 1 is another unit, no gain
@@ -49,8 +47,7 @@ _LARGE = 0.08  # payload over the arm's mass that errors of the links do not exp
 _MISMATCH = 7.5  # largest sum of squared errors of the links, in standard deviations
 _NOTHING = 0.01  # of the arm's mass, the smallest change of load
 _CLEARLY = 1.5  # least ratio of the misfit of other torque scales to that of a load
-_SEGMENT = 0.4  # [s] longer than the correlation of noise
-_SEGMENTS = 24
+_SEGMENT, _SEGMENTS = 0.4, 24  # [s] longer than the correlation of noise; most of them
 
 
 @dataclass(frozen=True)
@@ -78,11 +75,10 @@ class _Reading:
 
 def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
     """Yield the faults of signs, columns, gravity or URDF that keep the torques from fitting."""
-    # Only the reading that explains the torques best is reported; if it is the stated one, the
-    # URDF's masses are checked.
+    # Only the best reading is reported; if it is the stated one, the URDF's masses are checked.
     stated, loaded, others = explanations(probe)
     best = min(others, key=lambda e: e.misfit)
-    if best.kind not in ("torque_sign", "unsigned_torque") and loaded.misfit < best.misfit:
+    if best.kind not in _SIGNS and loaded.misfit < best.misfit:
         best = stated  # a load explains the torques better
     make = _FINDINGS.get(best.kind)
     findings = list(make(_Reading(probe, stated, best, name))) if make else []
@@ -97,21 +93,14 @@ def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
 
 
 def _sign(reading: _Reading) -> Iterator[Finding]:
+    code = reading.best.kind
     for j, joint in zip(reading.best.joints, reading.joints, strict=True):
         before, after = reading.stated.share[j], reading.best.share[j]
-        if before >= _WRONG and after <= _UNEXPLAINED:
-            evidence = {"unexplained": before, "unexplained_if_negated": after}
-            yield finding("torque_sign", reading.log, joint, **evidence)
-
-
-def _unsigned(reading: _Reading) -> Iterator[Finding]:
-    for j, joint in zip(reading.best.joints, reading.joints, strict=True):
-        before, after = reading.stated.share[j], reading.best.share[j]
-        if after <= _UNEXPLAINED:
-            yield finding(
-                "unsigned_torque", reading.log, joint, kind="one", cure="one", unexplained=before,
-                unexplained_with_signs=after,
-            )  # fmt: skip
+        figures = {"unexplained": before, "unexplained_if_negated": after}
+        if code == "unsigned_torque":
+            figures = {"unexplained": before, "unexplained_with_signs": after}
+        if after <= _UNEXPLAINED and (before >= _WRONG or code == "unsigned_torque"):
+            yield finding(code, reading.log, joint, kind="one", cure="one", **figures)
 
 
 def _moved(reading: _Reading) -> Iterator[Finding]:
@@ -126,9 +115,7 @@ def _moved(reading: _Reading) -> Iterator[Finding]:
     elif best.kind not in ("joint_order", "position_order"):
         worst = int(np.argmax(before - best.share))
         words = {"worst": joints[worst], "before": before[worst], "after": best.share[worst]}
-        words |= {"what": "log", "cure": "log"} | (
-            {"offset": best.values[0]} if best.values else {}
-        )
+        words |= {"what": "log", "cure": "log"} | dict(zip(["offset"], best.values, strict=False))
     yield finding(
         best.kind, reading.log, reading.joints, gain=reading.gain, unexplained=before.max(),
         unexplained_so_read=best.share.max(), **words,
@@ -155,21 +142,20 @@ def _gravity(reading: _Reading) -> Iterator[Finding]:
     )  # fmt: skip
 
 
+_SIGNS = ("torque_sign", "unsigned_torque")
 _MOVED = ("torque_order", "joint_order", "position_order", "joint_axis", "position_sign",
           "position_offset")  # fmt: skip
 _FINDINGS: dict[str, Callable[[_Reading], Iterator[Finding]]] = {
-    "torque_sign": _sign, "unsigned_torque": _unsigned, "gravity": _gravity,
+    **dict.fromkeys(_SIGNS, _sign), "gravity": _gravity,
     **dict.fromkeys(_MOVED, _moved),
 }  # fmt: skip
 
 
 def _is_excused(best: Explanation, loaded: Explanation) -> bool:
-    if best.kind in ("torque_sign", "unsigned_torque"):
-        excused = (
-            loaded.share[j] < min(_UNEXPLAINED, MUCH_BETTER * (best.share[j] + FLOOR))
-            for j in best.joints
-        )
-        return all(excused)
+    if best.kind in _SIGNS:
+        j = list(best.joints)
+        enough = np.minimum(_UNEXPLAINED, MUCH_BETTER * (best.share[j] + FLOOR))
+        return bool((loaded.share[j] < enough).all())
     return loaded.misfit - best.misfit < CERTAIN
 
 
@@ -257,8 +243,7 @@ def load_model(probe: Probe, share: Array, level: Array | None = None) -> LoadMo
 
 def _check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
     """Yield torques in another scale, a payload, a URDF of another robot."""
-    # Another scale is accepted if the torques then fit with about the URDF's masses; else the URDF
-    # is of another robot.
+    # Another scale must fit with about the URDF's masses; else the URDF is of another robot.
     model, ones = load_model(probe, share), np.ones(len(share))
     bodies = len(probe.model.layout.bodies)
     _, theta, error = model.fit(ones)
@@ -305,30 +290,17 @@ def _error_of_links(theta: Array) -> float:
 
 def _torque_scales(model: LoadModel) -> Array:
     """Return the factors of the torque columns that reduce the misfit significantly, else 1."""
-    n = len(model.R)
-    common = np.repeat(_SCALES[:, None], n, axis=1)
-    chi = model.misfits(np.vstack([np.ones(n), common]))
-    best = int(np.argmin(chi[1:]))
-    starts = [np.ones(n)]
-    is_other = abs(np.log(_SCALES[best])) > np.log(NO_ERROR_OF_MASSES)
-    if is_other and chi[0] - chi[1 + best] > SIGNIFICANT**2:
-        starts.append(common[best])
-    ends = np.array([_descended(model, start) for start in starts])
-    scale = ends[int(np.argmin(model.misfits(ends)))]
-    return np.where(model.R.any(axis=(1, 2)), scale, 1.0)
-
-
-def _descended(model: LoadModel, scale: Array) -> Array:
-    """Return the factors after a coordinate descent from initial ones."""
-    n = len(scale)
+    # In rounds: all torques by a factor that no errors of masses explain, or one torque more.
+    n, scale = len(model.R), np.ones(len(model.R))
+    common = _SCALES[np.abs(np.log(_SCALES)) > np.log(NO_ERROR_OF_MASSES)]
     for _ in range(n):
-        trials = np.repeat(scale[None], n * len(_SCALES), axis=0)
-        trials[np.arange(len(trials)), np.repeat(np.arange(n), len(_SCALES))] = np.tile(_SCALES, n)
-        chi = model.misfits(np.vstack([scale, trials]))
-        if chi[0] - chi[1:].min() < SIGNIFICANT**2:
+        one = np.where(np.eye(n, dtype=bool)[:, None], _SCALES[:, None], scale).reshape(-1, n)
+        trials = np.vstack([scale, np.repeat(common[:, None], n, axis=1), one])
+        chi = model.misfits(trials)
+        if chi[0] - chi.min() < SIGNIFICANT**2:
             break
-        scale = trials[int(np.argmin(chi[1:]))]
-    return scale
+        scale = trials[int(np.argmin(chi))]
+    return np.where(model.R.any(axis=(1, 2)), scale, 1.0)
 
 
 def _needed(model: LoadModel, scale: Array, other: Array) -> Array:
@@ -394,9 +366,7 @@ def check_payload_change(
     validation: Sequence[Reduction], independent: float, name: str,
 ) -> Iterator[Finding]:  # fmt: skip
     """Yield a warning if a validation log has another load than the fitted ones."""
-    # Both are fitted together, with free parameters of all links and a load in the last link of the
-    # validation log only. The load is reported if the same robot with it fits both. ``independent``
-    # is the number of independent samples.
+    # Both logs are fitted together, with a load in the last link of the validation log only.
     layout, every = model.layout, (*fitted, *validation)
     squares, samples = sum(r.squares for r in every), sum(r.samples for r in every)
     size = payload_spread(model)

@@ -6,7 +6,6 @@ applied to torque and regressor, because a filter of only one of them looks like
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -22,16 +21,15 @@ from robotid.diagnosis.logs.hypotheses import coupled_columns, smooth_motion
 from robotid.dynamics.rows import inertial_rows
 from robotid.robot.model import RobotModel
 
-_LONGEST = 0.1  # [s] largest delay of the grid
+_LONGEST, _NEAR = 0.1, 0.01  # [s] largest delay; width of the misfit's parabola around the delay
 _GRID = np.linspace(-_LONGEST, _LONGEST, 81)
-_NEAR = 0.01  # [s] around the delay, where the misfit is a parabola
-_FINEST = 0.001  # [s] apparent delay by friction that the model does not describe
-_HELD = 0.1  # [samples] ... or by a zero-order hold of the torque
-_DELAYED = 0.04  # [s] a longer delay must explain more: other model errors look like one, too
-_HELPS = 0.15  # least share of the unexplained torque that it must explain
+_FINEST, _HELD = 0.001, 0.1  # apparent delay by unknown friction [s], and a held torque [samples]
+# [s] A longer delay must explain this share of the unexplained torque: other model errors look
+# like one, too.
+_DELAYED, _HELPS = 0.04, 0.15
 _FEW = 100  # least number of rows of a joint that is used
-_SLOW = 0.05  # [rad/s] slower: a drive may be in stiction
-_AWAY = 0.75  # [periods of the filter] closer to a slow instant, friction is unknown
+# [rad/s] slower: a drive may be in stiction; [periods of the filter] friction around is unknown
+_SLOW, _AWAY = 0.05, 0.75
 _BLOCKS = 8  # number of segments with these instants in a long log, and of blocks of the jackknife
 _OVERSAMPLED = 8.0  # instants per period of the filter: the regressor has a larger bandwidth
 # Cut-off of the comparison over the job's, and over the rate at most, since interpolation smooths
@@ -102,27 +100,14 @@ def _at(delay: float, values: Array) -> Array:
     return np.asarray(values[..., k - 1] + share * (values[..., k] - values[..., k - 1]))
 
 
-@dataclass(frozen=True, eq=False)
-class _Window:
-    """Filtered torques at N instants of a motion, and the columns that may explain them."""
-
-    inertial: Array  # (N, columns), of the bodies that each joint carries, joint after joint
-    drive: Array  # (N, n, k), of each joint's inertia, frictions and position, of coupled drives
-    steady: Array  # (N, n), whether the drive is far from stiction
-    delayed: Array  # (N, delays, n), torques at each delay of the grid after the instants
-    load: Array  # (N, n), friction that grows with the URDF's torque, for a coefficient of 1
-
-
 def check_torque_delay(
     model: RobotModel, log: Log, signals: SignalSettings, name: str
 ) -> Iterator[Finding]:
     """Yield the delay of the torque relative to the position: "torque_delay", at most once."""
-    # The delay minimises the unexplained part of the delayed torque. The model has, besides the
-    # inertias, friction as an antisymmetric function of the speed, and a torque that is periodic in
-    # the position. Instants near slow ones are not used. The standard error is the jackknife's over
-    # the joints and over blocks of the log. The finding is a warning from three standard errors, if
-    # the delay of the other blocks explains each block better. A delay of more than 40 ms must
-    # explain at least 15 % of the unexplained torque.
+    # It minimises the unexplained torque. The model has friction antisymmetric in the speed and a
+    # torque periodic in the position; instants near slow ones are not used. The standard error is
+    # the jackknife's over joints and blocks of the log. The delay of the other blocks must explain
+    # each block better.
     step = float(np.median(np.diff(log.t)))
     rate = min(1 / step, signals.rate or np.inf)
     # the comparison is filtered even if the job has no filter: see _BAND
@@ -161,12 +146,14 @@ def _misfit(
     ]
     if not parts:
         return None
-    window = _Window(*map(np.concatenate, zip(*parts, strict=True)))
-    ends = np.cumsum(model.support[:, : model.layout.n_inertial].sum(axis=1)).tolist()
-    columns = [slice(*pair) for pair in pairwise([0, *ends])]
-    squares = [_squares(window, j, own) for j, own in enumerate(columns)]
+    inertial, *others = map(np.concatenate, zip(*parts, strict=True))
+    ends = np.cumsum(model.support[:, : model.layout.n_inertial].sum(axis=1))[:-1]
+    squares = [
+        _squares(columns, *(x[:, j] for x in others))
+        for j, columns in enumerate(np.split(inertial, ends, axis=1))
+    ]
     used = [one for one in squares if one is not None]
-    if len(used) < max(2.0, len(columns) / 2):
+    if len(used) < max(2.0, len(squares) / 2):
         return None
     plain, loaded, rows = zip(*used, strict=True)
     return _Misfit(np.array(plain), np.array(loaded), np.array(rows, dtype=float))
@@ -174,7 +161,8 @@ def _misfit(
 
 def _segments(model: RobotModel, motion: Trajectory, every: int) -> list[Array]:
     """Return contiguous rows, of one segment each, spread over the motion."""
-    moving = np.flatnonzero((np.abs(motion.v) > AT_REST * _units(model)).any(axis=1))
+    speed = np.abs(motion.v) / model.layout.drive_speeds[: len(model.joints)]
+    moving = np.flatnonzero((speed > AT_REST).any(axis=1))
     if len(moving) == 0:
         return []
     first, stop = int(moving[0]), int(moving[-1]) + 1
@@ -188,22 +176,18 @@ def _segments(model: RobotModel, motion: Trajectory, every: int) -> list[Array]:
     return [part for rows, at in zip(chosen, cuts, strict=True) for part in np.split(rows, at)]
 
 
-def _units(model: RobotModel) -> Array:
-    """Return the speed of each joint that counts as 1 rad/s, shape (n,)."""
-    return np.asarray(model.layout.drive_speeds[: len(model.joints)])
-
-
 def _window(
     model: RobotModel, motion: Trajectory, rows: Array, step: float, every: int,
     signals: SignalSettings, period: float,
 ) -> tuple[Array, ...]:  # fmt: skip
     """Return the filtered columns at every n-th of contiguous rows, without the ends."""
-    t, q, v, coarse = motion.t[rows], motion.q[rows], motion.v[rows] / _units(model), rows[::every]
+    speeds = motion.v / model.layout.drive_speeds[: len(model.joints)]  # 1 as 1 rad/s
+    t, q, v, coarse = motion.t[rows], motion.q[rows], speeds[rows], rows[::every]
     edge = max(_LONGEST, _SETTLED * period)
     inner = (motion.t[coarse] >= t[0] + edge) & (motion.t[coarse] <= t[-1] - edge)
     # friction as an antisymmetric function of the speed and torques periodic in the position, so
     # that they do not look like a delay; filtered before decimation, because friction jumps
-    top = np.maximum(np.abs(motion.v).max(axis=0) / _units(model), AT_REST)
+    top = np.maximum(np.abs(speeds).max(axis=0), AT_REST)
     signs = [np.tanh(v / speed) for speed in (AT_REST, 0.1 * top, 0.3 * top)]
     waves = [wave(k * q) for k in range(1, 1 + _HARMONICS) for wave in (np.cos, np.sin)]
     own = np.stack([motion.a[rows], v, *signs, v * np.abs(v), *waves], axis=2)
@@ -220,8 +204,8 @@ def _window(
     slow = is_reversal | (np.abs(v) < _SLOW)
     steady = [distance(at, t[slow[:, j]]) > _AWAY * period for j in range(v.shape[1])]
     tau = low_pass(motion.tau[rows], 1 / step, signals)
-    delayed = _interpolated(t, tau, at + _GRID[:, None]).swapaxes(0, 1)
-    drive = np.concatenate([own, coupled], axis=2)
+    delayed = np.moveaxis(_interpolated(t, tau, at + _GRID[:, None]), 0, 2)  # (N, n, delays)
+    drive = np.concatenate([own, coupled], axis=2)  # (N, n, k)
     return inertial, drive, np.column_stack(steady), delayed, load
 
 
@@ -243,28 +227,28 @@ def _interpolated(t: Array, values: Array, times: Array) -> Array:
     return np.asarray(CubicSpline(t, values)(times))
 
 
-def _squares(window: _Window, j: int, own: slice) -> tuple[Array, Array, int] | None:
-    """Return the unexplained part of joint j's torque, and its instants."""
-    # Its inertial columns are ``own``. The parts have shape (blocks, delays); in the second one
-    # friction grows with the load, too. None for a joint that moves in too few instants.
-    at = window.steady[:, j]
-    used = int(np.count_nonzero(at))
-    if used < max(_FEW, MOVING * len(at)):
+def _squares(
+    inertial: Array, drive: Array, steady: Array, delayed: Array, load: Array
+) -> tuple[Array, Array, int] | None:
+    """Return the unexplained part of a joint's torque, and its instants."""
+    # Shapes (blocks, delays), in the second friction grows with the load; None if it hardly moves.
+    used = int(np.count_nonzero(steady))
+    if used < max(_FEW, MOVING * len(steady)):
         return None
-    inertial, drive, load = window.inertial[at, own], window.drive[at, j], window.load[at, j]
-    tau = np.ascontiguousarray(window.delayed[at, :, j].T)
+    inertial, drive, load = inertial[steady], drive[steady], load[steady]
+    tau = np.ascontiguousarray(delayed[steady].T)
     tau -= tau.mean(axis=1, keepdims=True)  # (delays, N)
-    size = np.einsum("dk,dk->d", tau, tau)
+    size = np.sum(tau**2, axis=1)
     if size.min() <= 0:
         return None
     Q = _orthonormal(np.hstack([inertial, drive, np.ones((used, 1))]))
     tau -= (tau @ Q) @ Q.T
     blocks = np.array_split(tau, _BLOCKS, axis=1)
-    plain = np.array([np.einsum("dk,dk->d", b, b) for b in blocks]) / size
+    plain = np.array([np.sum(b**2, axis=1) for b in blocks]) / size
     rest = load - Q @ (Q.T @ load)
     if rest @ rest > _EXACT**2 * load @ load:
-        tau -= np.outer(tau @ rest, rest / (rest @ rest))
-    return plain, np.array([np.einsum("dk,dk->d", b, b) for b in blocks]) / size, used
+        tau -= np.outer(tau @ rest, rest / (rest @ rest))  # of the blocks, too
+    return plain, np.array([np.sum(b**2, axis=1) for b in blocks]) / size, used
 
 
 def _orthonormal(X: Array) -> Array:

@@ -143,8 +143,8 @@ def explain_residual(
     fit: Fit, sample: Sample | None
 ) -> tuple[tuple[Misfit, ...], tuple[Finding, ...]]:
     """Return the terms that drive models lack, and differences of recordings or URDF."""
-    # A spring and a position offset imitate each other: what explains more of the residual of all
-    # joints together is accepted first, and the other readings are tested again together with it.
+    # A spring and a position offset imitate each other: what explains more of the whole residual is
+    # accepted first, and the other is tested again together with it.
     model = fit.model
     if sample is None or model.free_flyer or model.constraints or model.passive:
         return (), ()
@@ -240,8 +240,7 @@ def _refined(
     applied: Callable[[Array], _Altered], x: Array, pi: Array, sample: Sample
 ) -> tuple[Array, Array, Sample]:
     """Return the sizes of an alteration, their standard errors, and the samples corrected by it."""
-    # Torques are nonlinear over a tenth of a radian: Gauss-Newton steps are repeated until the
-    # sizes converge.
+    # Torques are nonlinear over 0.1 rad: Gauss-Newton steps until the sizes converge.
     every, error = list(range(len(x))), np.full(len(x), np.inf)
     for _ in range(_STEPS):
         model, at = applied(x)

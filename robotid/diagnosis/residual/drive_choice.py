@@ -1,17 +1,13 @@
 """Selection of the terms of each joint's drive: the fewest that explain held-out segments.
 
-Terms are added to viscous and Coulomb friction, joint by joint, on samples spread over the fitted
-logs. The family that explains most of the held-out segments is selected if it is significant, then
-the next one together with it, until no family improves the fit. Validation logs are not used.
+Terms are added to viscous and Coulomb friction, joint by joint: the family that explains most is
+selected if it is significant, then the next one together with it. Validation logs are not used.
 Where the prior binds the bodies, those of least squares replace them: a wrong prior does not become
-friction, and a term that inertia explains as well has no gain.
+friction.
 
-The nonlinear parameters of a family, its shape, are searched on a grid. Then all shapes of a joint
-are refined together, with the linear parameters refitted in each step (variable projection, Golub,
-Pereyra 2003).
-
-Where constraint forces were eliminated, the torque of a drive appears in the rows of other joints,
-too. The families of each joint are then selected again together with those of the others.
+The nonlinear parameters of a family, its shape, are searched on a grid, then those of a joint are
+refined together (variable projection, Golub, Pereyra 2003). Where constraint forces were
+eliminated, the families of each joint are selected again together with those of the others.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -33,8 +29,7 @@ from robotid.estimation.fitting.fitted import Solution
 from robotid.robot.drive_term import DataRange, DriveMotion, DriveTerm, Family, MemorylessTerm
 from robotid.robot.drives import FAMILIES
 
-_GRID = 6  # values of a shape tested between its bounds
-_SPAN = 100.0  # largest over smallest of them; an upper bound beyond is also tested
+_GRID, _SPAN = 6, 100.0  # values of a shape that are tested; largest over smallest of them
 _REVOLUTION = 2 * np.pi  # [rad]
 _STEPS = 40  # iterations of the search for all shapes of a joint together
 _LOADED = ("load", "lag")  # families that depend on the torque of the drive
@@ -142,14 +137,10 @@ def _candidates(drive: _Drive, families: Sequence[Family]) -> Iterator[_Sized]:
         terms = family.make(drive.data_range, *[low for low, _ in bounds])
         if not drive.has_load and any(term.needs_load for term in terms):
             continue
-        grids = [_sizes(low, high) for low, high in bounds]
-        yield from ((family, [float(x) for x in sizes]) for sizes in product(*grids))
-
-
-def _sizes(low: float, high: float) -> Array:
-    """Return the tested values of a shape."""
-    grid = np.geomspace(low, min(high, _SPAN * low), _GRID)
-    return grid if grid[-1] >= high else np.append(grid, high)
+        grids = [np.geomspace(low, min(high, _SPAN * low), _GRID).tolist() for low, high in bounds]
+        for grid, (_, high) in zip(grids, bounds, strict=True):
+            grid += [high] * (grid[-1] < high)
+        yield from ((family, list(sizes)) for sizes in product(*grids))
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,20 +148,19 @@ class _Options:
     """Candidates of a joint, with every shape on the grid, and their residuals."""
 
     own: list[_Sized]
-    place: list[list[int]]  # columns of each
+    place: dict[int, list[int]]  # columns of each
     is_positive: Array  # columns whose parameter cannot be negative, bool
     highest: Array  # upper bounds of their parameters
     trials: Trials
 
     @classmethod
     def of(cls, sample: Sample, drive: _Drive, own: list[_Sized]) -> "_Options":
-        terms = [family.make(drive.data_range, *sizes) for family, sizes in own]
-        ends = np.cumsum([len(those) for those in terms]).tolist()
-        place = [list(range(e - len(those), e)) for those, e in zip(terms, ends, strict=True)]
-        flat = [term for those in terms for term in those]
+        terms = [_terms(drive, [one]) for one in own]
+        columns = {i: drive.columns(of_family)[:, None] for i, of_family in enumerate(terms)}
+        trials, place = Trials.of(sample, columns)
+        flat = [term for of_family in terms for term in of_family]
         positive = np.array([term.is_nonnegative for term in flat], dtype=bool)
         highest = np.array([min(x.highest, drive.largest / _amplitude(drive, x)) for x in flat])
-        trials = Trials(sample, drive.columns(flat)[:, None])
         return cls(own, place, positive, highest, trials)
 
     def name(self, i: int) -> str:
@@ -187,8 +177,7 @@ class _Options:
 
     def left_each(self, chosen: Sequence[int]) -> dict[int, Array]:
         """Return the squared residual of each segment with those chosen and another candidate."""
-        # Only of candidates with physical parameters: friction opposes motion and is below the
-        # largest torque of the joint. A joint has one family of each kind.
+        # Of candidates that oppose motion, below the largest torque, one family of each kind.
         kinds = {_kind(self.name(k)) for k in chosen}
         other = [i for i in range(len(self.own)) if _kind(self.name(i)) not in kinds]
         columns = {i: self._columns([*chosen, i]) for i in other}
@@ -268,9 +257,8 @@ def _conditioned(
 ) -> _Refined:  # fmt: skip
     """Return the best candidate, or an equally good, better conditioned one of another family."""
 
-    # Equally good: its residual of held-out segments is not larger than that of the best, within
-    # the standard error of the difference. Better conditioned: no shape is at its bound, or no term
-    # increases the standard error of another parameter of the drive tenfold, unlike the best.
+    # Equally good: the residual of held-out segments is as small, within its standard error. Better
+    # conditioned: no shape at its bound, or no standard error of the drive increased tenfold.
     def refined(i: int) -> _Refined:
         own = _refined(sample, drive, [every.own[k] for k in (*chosen, i)])
         weighted = _reweighted(sample, drive, own)
@@ -344,10 +332,9 @@ def _fixed(sample: Sample, drive: _Drive, names: Sequence[str]) -> DriveChoice:
         for at, group in enumerate(groups):
             rest = [*chosen[:at], *chosen[at + 1 :]]
             chosen[at] = min(group, key=lambda i: float(every.left([*rest, i]).sum()))
-    torque = float(sample.torque[0])
-    tried = (
-        Tried((), _percent(every.left([]), torque), 1.0, False),
-        Tried(tuple(names), _percent(every.left(chosen), torque), 1.0, True),
+    tried = tuple(
+        Tried(which, _percent(every.left(columns), float(sample.torque[0])), 1.0, bool(which))
+        for which, columns in (((), []), (tuple(names), chosen))
     )
     return _found(sample, drive, [every.own[i] for i in chosen], tried)
 
@@ -361,7 +348,7 @@ def _found(
     covariance = np.empty((0, 0))
     if len(flat):
         count, trial = _with_slopes(weighted, drive, refined)
-        _, every = trial.estimate(list(range(count + len(flat))), weighted.fitted)
+        every = trial.estimate(list(range(count + len(flat))), weighted.fitted)[1]
         covariance = every[count:, count:]
     named = [(family.name, shape) for family, _ in refined for shape in family.shapes]
     errors, is_at_bound = np.sqrt(np.diag(covariance)), _at_bound(drive, refined)
@@ -398,9 +385,7 @@ def _at_bound(drive: _Drive, chosen: Sequence[_Sized]) -> Array:
 
 def _grown(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> dict[str, float]:
     """Return the factor by which terms increase the standard error of each plain parameter."""
-    # With X the columns of terms and shapes, M = 1 - W (W^T W + 1)^-1 W^T and T = (W^T W + 1)^-1
-    # W^T X, the covariance (W^T W + 1)^-1 of the base parameters becomes that plus T (X^T M X)^-1
-    # T^T.
+    # C = (W^T W + 1)^-1 becomes C + T (X^T M X)^-1 T^T, with T = C W^T X, M = 1 - W C W^T.
     if not chosen:
         return {}
     _, trial = _with_slopes(sample, drive, chosen)
@@ -416,8 +401,7 @@ def _grown(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> dict[str,
 
 def _reweighted(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> Sample:
     """Return the samples with the joint's weights from its residual with the new terms."""
-    # With the residual without them the weights of this joint would be far too small, compared with
-    # those of other joints and with the prior.
+    # Without them the joint's weights would be far too small beside other joints and the prior.
     if not chosen:
         return sample
     terms = _terms(drive, chosen)

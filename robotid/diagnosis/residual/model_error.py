@@ -1,14 +1,12 @@
 """Standard errors that include model errors: missing drive terms, and uncertain friction shapes.
 
-A term that the drives have and the model lacks changes the other parameters by -T theta, with its
-own parameters theta. This is a bias and does not decrease with the length of the log: its square
-is added to their covariance. So is that of a term that was nearly selected. A fitted shape has a
-standard error, which adds to theirs:
+A term with parameters theta that the model lacks, or that was nearly selected, changes the others
+by -T theta, a bias: its square is added to their covariance. So is the error of a fitted shape:
 
     C += sum_terms (T theta) (T theta)^T + sum_joints T C_s T^T,  T = (W^T W + C_0^-1)^-1 W^T z
 
-The error of a prediction has two parts, the changed parameters and the missing torque, which partly
-cancel: W T theta - z theta. Hence each term is stored as an ``OpenTerm``, with its part of C.
+In a prediction changed parameters and missing torque partly cancel, W T theta - z theta: each term
+is stored as an ``OpenTerm``.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -20,7 +18,7 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.diagnosis.decisions import GROWN, ROUNDING, STEP, TINY
 from robotid.diagnosis.residual.misfit import Misfit
-from robotid.diagnosis.residual.term_trials import Sample, Trial, Trials, take_sample
+from robotid.diagnosis.residual.term_trials import RIDGE, Sample, Trial, Trials, take_sample
 from robotid.dynamics.prediction import drive_motion_along
 from robotid.estimation.fitting.drive_terms import DriveChoice, JointMotion, OpenTerm
 from robotid.estimation.fitting.fitted import Fit, Solution
@@ -77,7 +75,7 @@ def _of_shapes(fit: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> Iter
     # The errors of a joint's shapes are correlated: C_s = L L^T, one direction per column of L.
     for choice in fit.drives:
         if choice.shapes:
-            T = _shape_trial(fit, choice, sample, motions).T[:, :-1]
+            T = _trial(sample, choice, motions, partial(_slopes, fit, choice), ROUNDING).T[:, :-1]
             variance, axes = np.linalg.eigh(np.array(choice.shape_covariance))
             for axis in (axes * np.sqrt(np.maximum(variance, 0.0))).T:
                 torque = partial(_shape_change, fit, choice, axis)
@@ -93,20 +91,17 @@ def _shape_change(
     fit: Fit, choice: DriveChoice, axis: Array, motion: DriveMotion, alone: JointMotion
 ) -> Array:
     """Return the change of a drive's torque for a change of its shapes by (k,), shape (N,)."""
-    slopes = [shape_slope(fit, choice, k, motion) for k in range(len(axis))]
-    return np.asarray(np.column_stack(slopes) @ axis)
+    return np.asarray(_slopes(fit, choice, motion) @ axis)
 
 
-def _shape_trial(
-    fit: Solution, choice: DriveChoice, sample: Sample, motions: Sequence[DriveMotion]
-) -> Trial:
-    """Return a trial of the columns d(torque)/d(shape) of a joint, with all that was fitted."""
-    j, shapes = sample.joints.index(choice.joint), range(len(choice.shapes))
-    slopes = [
-        np.column_stack([shape_slope(fit, choice, k, motion.of(j)) for k in shapes])[rows]
-        for motion, rows in zip(motions, sample.taken, strict=True)
-    ]
-    return Trials(sample.of_joint(j), np.concatenate(slopes)[:, None], ROUNDING).whole
+def _trial(
+    sample: Sample, choice: DriveChoice, motions: Sequence[DriveMotion],
+    columns: Callable[[DriveMotion], Array], ridge: float = RIDGE,
+) -> Trial:  # fmt: skip
+    """Return a trial of columns (N, c) of a joint's motions, with all that was fitted."""
+    j, taken = sample.joints.index(choice.joint), zip(motions, sample.taken, strict=True)
+    Z = np.concatenate([columns(motion.of(j))[rows] for motion, rows in taken])
+    return Trials(sample.of_joint(j), Z[:, None], ridge).whole
 
 
 def settled_shapes(fit: Solution) -> tuple[DriveChoice, ...] | None:
@@ -118,7 +113,7 @@ def settled_shapes(fit: Solution) -> tuple[DriveChoice, ...] | None:
     motions, drives, farthest = _motions(fit, sample), [], 0.0
     for choice in fit.drives:
         if choice.shapes:
-            whole = _shape_trial(fit, choice, sample, motions)
+            whole = _trial(sample, choice, motions, partial(_slopes, fit, choice), ROUNDING)
             step, covariance = whole.estimate(list(range(len(choice.shapes))), sample.fitted)
             moved = choice.moved(step, covariance)
             before, after = (np.array([s.value for s in c.shapes]) for c in (choice, moved))
@@ -132,12 +127,7 @@ def settled_shapes(fit: Solution) -> tuple[DriveChoice, ...] | None:
 def _of_undecided(fit: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> Iterator[_Move]:
     """Yield the uncertain parts of terms that were nearly selected."""
     for choice in (choice for choice in fit.drives if choice.undecided):
-        j = sample.joints.index(choice.joint)
-        columns = [
-            np.column_stack([term.column(motion.of(j)) for term in choice.undecided])[rows]
-            for motion, rows in zip(motions, sample.taken, strict=True)
-        ]
-        whole = Trials(sample.of_joint(j), np.concatenate(columns)[:, None]).whole
+        whole = _trial(sample, choice, motions, partial(_columns, choice.undecided))
         theta = whole.parameters(range(len(choice.undecided)))
         torque = partial(_of_terms, choice.undecided, theta)
         yield _Move(choice.joint, -whole.T[:, :-1] @ theta, torque)
@@ -147,7 +137,11 @@ def _of_terms(
     terms: Sequence[DriveTerm], theta: Array, motion: DriveMotion, alone: JointMotion
 ) -> Array:
     """Return the torque of terms of a drive, shape (N,)."""
-    return np.asarray(np.column_stack([term.column(motion) for term in terms]) @ theta)
+    return np.asarray(_columns(terms, motion) @ theta)
+
+
+def _columns(terms: Sequence[DriveTerm], motion: DriveMotion) -> Array:
+    return np.column_stack([term.column(motion) for term in terms])  # (N, c)
 
 
 def _motions(fit: Solution, sample: Sample) -> list[DriveMotion]:
@@ -156,11 +150,12 @@ def _motions(fit: Solution, sample: Sample) -> list[DriveMotion]:
     return [drive_motion_along(model, x.trajectory) for x in sample.recordings]
 
 
-def shape_slope(fit: Solution, choice: DriveChoice, which: int, motion: DriveMotion) -> Array:
-    """Return the derivative of a drive's torque with respect to one of its shapes, shape (N,)."""
-    theta = dict(zip(fit.model.layout.names, fit.standard, strict=True))
-    change = np.zeros_like(motion.v)
-    for term, other in zip(choice.terms, choice.altered(which, STEP), strict=True):
-        parameter = theta[f"{choice.joint}.{term.name}"]
-        change += parameter * (other.column(motion) - term.column(motion))
-    return np.asarray(change / (choice.shapes[which].value * STEP))
+def _slopes(fit: Solution, choice: DriveChoice, motion: DriveMotion) -> Array:
+    """Return the derivatives of a drive's torque by its shapes, shape (N, k)."""
+    parameters = dict(zip(fit.model.layout.names, fit.standard, strict=True))
+    theta = np.array([parameters[f"{choice.joint}.{term.name}"] for term in choice.terms])
+    stated = _columns(choice.terms, motion)
+    return np.column_stack([
+        (_columns(choice.altered(k, STEP), motion) - stated) @ theta / (shape.value * STEP)
+        for k, shape in enumerate(choice.shapes)
+    ])  # fmt: skip

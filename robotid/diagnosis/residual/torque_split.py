@@ -38,8 +38,7 @@ _BINS = 10  # of a quantity, with equal numbers of samples
 class TorqueSplit:
     """Parts of predicted torques."""
 
-    # These are "gravity", "inertia" and "Coriolis" (with centrifugal torques) of the bodies, then
-    # the torques of the drives, by ``DriveTerm.part``.
+    # "gravity", "inertia", "Coriolis" of bodies, then those of drives, by ``DriveTerm.part``.
 
     parts: Mapping[str, Array]  # each of shape (N, n_rows) [N m, N]
     names: tuple[str, ...]  # of the k drive parameters
@@ -99,19 +98,16 @@ class Rows:
         starts = np.flatnonzero(np.diff(self.recording, prepend=-1))
         if len(starts) == 1:
             return self.t
-        lengths = np.array([np.ptp(self.t[self.recording == k]) for k in range(len(starts))])
-        before = np.concatenate([[0.0], np.cumsum(lengths)[:-1]])
-        return np.asarray(self.t - self.t[starts][self.recording] + before[self.recording])
+        lengths = [np.ptp(part) for part in np.split(self.t, starts[1:])]
+        shift = np.cumsum([0.0, *lengths[:-1]]) - self.t[starts]
+        return np.asarray(self.t + shift[self.recording])
 
     @cached_property
     def pieces(self) -> Array:
         """Piece of each sample, 16 per recording, numbered on, shape (N,), int."""
-        count = _QUARTERS**2
-        pieces = np.empty(len(self.t), dtype=int)
-        for k in range(len(self.recordings)):
-            own = self.recording == k
-            pieces[own] = count * k + np.arange(own.sum()) * count // max(own.sum(), 1)
-        return pieces
+        rows, count = np.bincount(self.recording), _QUARTERS**2
+        place = np.arange(len(self.t)) - np.repeat(np.cumsum(rows) - rows, rows)
+        return np.asarray(count * self.recording + place * count // np.repeat(rows, rows))
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,8 +123,7 @@ class JointTorque:
     terms: Mapping[str, Mapping[str, Array]]  # (N,) of each drive parameter, by part and name
     #: Quantities that the residual may depend on: unit and values, (N,), by name.
     quantities: Mapping[str, tuple[str, Array]]
-    #: Share of the squared residual above the filter's cut-off: not correlated over one period of
-    #: it, or from sample to sample without a filter; None if not available.
+    #: Share of the squared residual above the filter's cut-off, or white; None if not available.
     broadband: float | None
     fitted: JointTorque | None = None  # of the fitted recordings; None if it is of them itself
 
@@ -177,7 +172,6 @@ class JointTorque:
     @cached_property
     def against_time(self) -> tuple[Array, str]:
         """The residual that is tested against time, shape (N,), and the subtracted quantity."""
-        # The means over the quantity that explains most are subtracted; "" if there is none.
         return self._less_best(self.follows[:-1])
 
     def _less_best(self, tested: Sequence[Dependence]) -> tuple[Array, str]:
@@ -236,8 +230,7 @@ class JointTorque:
 
 def joint_torques(fit: Fit) -> tuple[JointTorque, ...]:
     """Return the torque of each row, its parts, and what its residual depends on."""
-    # The samples, at most 4000, are spread over the validation recordings, or over the fitted ones
-    # if there are none.
+    # At most 4000 samples, of the validation recordings, or of the fitted ones if there are none.
     validation = [e for e in fit.validation if not e.is_refitted]
     fitted = _torques_of(fit, fit.fitted)
     if not validation:
@@ -341,11 +334,8 @@ class Dependence:
     unit: str  # of the quantity
     centres: Array  # (B,), mean of the quantity in each bin
     means: Array  # (B,), mean residual in each bin [N m or N]
-    #: (B,), standard error of these means, from their scatter between segments; NaN in bins of
-    #: fewer than three segments.
-    errors: Array
-    #: Share of the residual's variance that the means of other segments explain; None if there are
-    #: too few segments. A negative share means that they explain nothing.
+    errors: Array  # (B,), standard errors of the means between segments; NaN for fewer than three
+    #: Share of the variance that the means of other segments explain; None with too few segments.
     share: float | None
     p_value: float  # p-value of that share [-]
 
@@ -376,11 +366,10 @@ def follow(
     name: str, unit: str, x: Array, r: Array, bins: Array, segments: Array | None
 ) -> Dependence:
     """Return the dependence of a residual on a quantity."""
-    # With N_kb samples and the sum S_kb of their residuals in segment k and bin b, the mean of a
-    # bin is m_b = sum_k S_kb / n_b. Its variance is sum_k (S_kb - N_kb m_b)^2 / n_b^2, for
-    # independent clusters (Liang, Zeger 1986). The squared residual of segment k after the means of
-    # the other segments is compared with that after their common mean; for a single bin, with that
-    # around 0.
+    # m_b = sum_k S_kb / n_b for N_kb samples with the sum S_kb in segment k and bin b; its variance
+    # is sum_k (S_kb - N_kb m_b)^2 / n_b^2, for independent clusters (Liang, Zeger 1986). Each
+    # segment is predicted by the means of the others and by their common mean; a single bin by them
+    # and by 0.
     n = np.bincount(bins).astype(float)
     centres, means = np.bincount(bins, x) / n, np.bincount(bins, r) / n
     if segments is None:
@@ -417,7 +406,7 @@ def even_bins(x: Array) -> Array:
 
 def friction_split(model: RobotModel, evaluation: Evaluation, pi: Array) -> tuple[Array, Array]:
     """Return the measured torque without rigid-body torques, and the identified friction."""
-    # The first is tau - Y pi with pi without friction and offset, the second their torque.
+    # tau - Y pi, with pi without friction and offset, and their torque.
     layout, trajectory = model.layout, evaluation.recording.trajectory
     is_drive_inertia = [term.is_inertia for _, term in layout.drive_parameters]
     stiff = np.array([True] * layout.n_inertial + is_drive_inertia)

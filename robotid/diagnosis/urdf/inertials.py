@@ -17,7 +17,7 @@ from robotid.robot.geometry import body_points, kinematic_lengths
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.prior import REASONS, assumed_masses
-from robotid.robot.tree import Inertial, Joint, Tree, exact_angle, numbers
+from robotid.robot.tree import Inertial, Tree, exact_angle, numbers
 
 #: Findings that take the URDF's masses as evidence.
 _OF_MASSES = (
@@ -25,9 +25,7 @@ _OF_MASSES = (
 )  # fmt: skip
 _DENSEST, _LIGHTEST = 20_000.0, 10.0  # [kg/m^3] over the box: about solid tungsten, and foam
 _MARGIN = 0.1  # of the box's diagonal, by which a centre of mass may lie outside
-_LONGEST = np.sqrt(
-    5.0
-)  # ellipsoid of a body with half of its mass on each of two sides, over the box
+_LONGEST = np.sqrt(5.0)  # ellipsoid of a body with its mass on two sides, over the box
 _SLENDER = 1.6  # ellipsoid over the length that the kinematics give; a uniform rod has 1.29
 _THIN = 0.01  # [m] least side of a box, so that thin sheets have a volume
 _SMALL = 1e-3  # share of the robot's mass below which a fault of a body is only a note
@@ -53,13 +51,11 @@ def assumed_inertials(model: RobotModel) -> list[Finding]:
         bodies = [body for body in model.layout.bodies if model.assumed.get(body) == code]
         if bodies:
             mass = sum(float(pi[10 * model.layout.bodies.index(body)]) for body in bodies)
-            findings += [
-                finding(
-                    code, subject=f"link {bodies[0]}", severity="warning", what="assumed",
-                    cure="assumed", reason=reason, links=listed(bodies, 12), bodies=len(bodies),
-                    mass=mass,
-                )
-            ]  # fmt: skip
+            one = finding(
+                code, subject=f"link {bodies[0]}", severity="warning", what="assumed", mass=mass,
+                cure="assumed", reason=reason, links=listed(bodies, 12), bodies=len(bodies),
+            )  # fmt: skip
+            findings.append(one)
     return findings
 
 
@@ -148,13 +144,12 @@ def _between(mapping: BaseMapping) -> int:
 
 def _rounded(tree: Tree) -> dict[str, dict[str, float]]:
     """Return the rounded angles of each joint, as written, and the exact angles."""
-    rounded = {}
+    rounded: dict[str, dict[str, float]] = {}
     for joint in tree.robot.findall("joint"):
         origin = joint.find("origin")
-        words = origin.get("rpy", "").split() if origin is not None else []
-        exact = {word: angle for word in words if (angle := exact_angle(word)) is not None}
-        if exact:
-            rounded[joint.get("name", "")] = exact
+        for word in origin.get("rpy", "").split() if origin is not None else []:
+            if (angle := exact_angle(word)) is not None:
+                rounded.setdefault(joint.get("name", ""), {})[word] = angle
     return rounded
 
 
@@ -173,19 +168,17 @@ def _effect(model: RobotModel, mapping: BaseMapping) -> tuple[str, dict[str, flo
 def _carrying(tree: Tree) -> set[str]:
     """Return the joints that move or carry a moving joint: their angles affect the dynamics."""
     arriving = {joint.child: joint for joint in tree.joints}
-    carrying: set[str] = set()
+    carrying = {joint.name for joint in tree.movable}
     for joint in tree.movable:
-        at: Joint | None = joint
-        while at is not None and at.name not in carrying:
-            carrying.add(at.name)
-            at = arriving.get(at.parent)
+        while joint.parent in arriving:
+            joint = arriving[joint.parent]
+            carrying.add(joint.name)
     return carrying
 
 
 def audit_links(model: RobotModel) -> Iterator[Finding]:
     """Yield implausible inertials of a robot."""
-    # A body is a moving link with all links that are fixed to it. The collision geometry is used,
-    # or the visual one; a body whose geometry cannot be read is not checked.
+    # A body is a moving link with all links fixed to it; without readable geometry it is skipped.
     yield from _templates(model)
     points = body_points(model)
     yield from audit_bodies(model, model.standard_parameters(), points)
@@ -256,8 +249,7 @@ def _against_geometry(body: str, J: Array, points: Array) -> Iterator[Finding]:
 
 def _against_kinematics(body: str, J: Array, length: float, longest: float) -> Iterator[Finding]:
     """Yield the parameters of a body without geometry that are impossible for its length [m]."""
-    # A body may be wide where its joints are close: warnings need more than the longest of all
-    # bodies allows.
+    # Wide bodies have close joints: warnings need more than the longest of all bodies allows.
     of_link, centre = {"subject": f"link {body}", "link": body}, J[:3, 3] / J[3, 3]
     distance = float(np.linalg.norm(centre))
     if distance > max(length, longest):

@@ -30,15 +30,16 @@ from robotid.robot.parameters import pseudo_inertia
 _BIASED = 0.5, 2.0  # shift of a parameter by encoder noise, in standard errors: note, warning
 _COARSE = 0.1  # share of encoder noise over the largest one, from which a joint is named
 _DIFFERS = 1.2  # residual of a consistent fit over that of WLS above which it is reported
-_SHRUNK = 0.1  # of the URDF's smallest eigenvalue: below, a body is barely possible
-_MUCH = 0.2  # ... if links on locked joints have more than this share of its mass
+# Of the URDF's smallest eigenvalue: below, a body is barely possible, if links on locked joints
+# have more than this share of its mass.
+_SHRUNK, _MUCH = 0.1, 0.2
 _USER_BOUNDS = ("mass ", "total_mass ", "centre_of_mass ")
 _DENSEST = 12_000.0  # [kg/m^3] of a link: lead has 11,340
 _UNLIKELY = 0.05  # share of the bodies that the errors allow below which one is not possible
 _AT_BOUND = 1e-3  # relative difference of a mass from a stated bound that determines it
 _VANISHED = 0.05  # share of a link's URDF mass below which the link has practically vanished
-_LEFT = 1 / 3  # largest share of the squared error that a gain of the torque leaves
-_MOSTLY = 0.6  # share of friction in a torque from which friction may have changed, too
+# Of the squared error, that a gain of the torque leaves; of friction, which may have changed, too.
+_LEFT, _MOSTLY = 1 / 3, 0.6
 
 
 def fit_findings(
@@ -80,8 +81,7 @@ def fit_findings(
 
 def _costs(fit: Fit) -> Iterator[Finding]:
     """Yield the joints whose torque error the constraints increase."""
-    # It is a note if they add little, sqrt(error^2 - wls^2) of the torque, the verdict does not
-    # count it, and the user states no constraint; and if WLS predicts unseen recordings worse.
+    # A note if they add little, sqrt(error^2 - wls^2), unless stated; or if WLS predicts worse.
     wls, settings, locked = fit.metrics("wls").per_joint, fit.estimator, _locked_links(fit)
     asked = ""  # the constraints that the user states
     if isinstance(settings, BoundedSettings) and any(settings.constraints.values()):
@@ -146,7 +146,6 @@ def _drive_findings(fit: Fit) -> Iterator[Finding]:
 
 def correlated_findings(fit: Fit) -> Iterator[Finding]:
     """Yield notes on drives with parameters of which only the sum is determined."""
-    # They have a strongly correlated pair, or terms that increase another standard error tenfold.
     names, pairs = fit.model.layout.names, correlated_parameters(fit)
     joints = list(dict.fromkeys(names[i].rpartition(".")[0] for i in pairs))
     for joint in joints:
@@ -186,8 +185,7 @@ def not_written(log_errors: Sequence[Finding], inconsistent: str = "") -> Iterat
 
 def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]:
     """Return a warning about locked joints whose positions matter but were not stated."""
-    # A position matters if the locked joint is on a chain with an identified joint: the pose of the
-    # legs does not change the torques of an arm. On a floating base all positions matter.
+    # A position matters on a chain with an identified joint; on a floating base all matter.
     relevant = set(model.locked) if model.free_flyer else _in_line(model)
     assumed = [name for name in model.locked if name not in stated and name in relevant]
     return [finding("locked_at_zero", "", assumed)] if assumed else []
@@ -196,11 +194,11 @@ def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]
 def _in_line(model: RobotModel) -> set[str]:
     """Return the joints that carry an identified joint, or are carried by one."""
     above = {joint.child: joint for joint in model.tree.joints}
-    carriers: dict[str, set[str]] = {}
+    carriers: dict[str, set[str]] = {joint.name: set() for joint in model.tree.joints}
     for joint in model.tree.joints:
-        own, link = carriers.setdefault(joint.name, set()), joint.parent
+        link = joint.parent
         while link in above:
-            own.add(above[link].name)
+            carriers[joint.name].add(above[link].name)
             link = above[link].parent
     identified = set(model.joints)
     carrying = set[str]().union(*(carriers[name] for name in identified))
@@ -290,8 +288,7 @@ def _is_within_box(fit: Fit, body: str, box: Array) -> bool:
 
 def _impossible_shapes(fit: Fit) -> Iterator[Finding]:
     """Yield the identified bodies that are not possible in their geometry."""
-    # As notes if the URDF's body is not possible either, or if the body is in the box of a fit with
-    # extents. Bodies of negligible mass are left out.
+    # Notes if the URDF's is not either, or in the box of the fit; without negligible bodies.
     model, points = fit.model, body_points(fit.model)
     boxes, negligible = body_boxes(model), negligible_bodies(model)
     before = {(fault.code, fault.where) for fault in audit_bodies(model, fit.prior, points)}
@@ -300,23 +297,23 @@ def _impossible_shapes(fit: Fit) -> Iterator[Finding]:
         if body in negligible:  # it keeps the URDF's values, and has no effect
             continue
         if (fault.code, fault.where) in before:
-            fault = fault.reworded(severity="note", remedy="; the URDF has the same fault")
-        else:
-            fault = fault.reworded(fault=f"as identified, {fault.fault}")
-            remedy = f". {_cure(fit, body)}. The predicted torque may still be right; do not use "
-            remedy += "mass, centre of mass and inertia of this link"
-            if _is_within_box(fit, body, boxes[body]):
-                fault = fault.reworded(severity="note")
-                remedy = "; it is within the margin of the fit"
-            fault = fault.reworded(remedy=remedy)
-        yield fault
+            yield fault.reworded(severity="note", remedy="; the URDF has the same fault")
+            continue
+        severity, remedy = (
+            fault.severity,
+            f". {_cure(fit, body)}. The predicted torque may still be ",
+        )
+        remedy += "right; do not use mass, centre of mass and inertia of this link"
+        if _is_within_box(fit, body, boxes[body]):
+            severity, remedy = "note", "; it is within the margin of the fit"
+        text = f"as identified, {fault.fault}"
+        yield fault.reworded(fault=text, severity=severity, remedy=remedy)
 
 
 def _dense_bodies(fit: Fit) -> Iterator[Finding]:
     """Yield the identified bodies whose inertia needs a density above that of any material."""
-    # As notes if the errors of mass and inertia allow a body of a material and no stated mass
-    # determines it. Bodies that have this density in the URDF are left out, and all of a result
-    # that is not physically consistent, which is a reason of its own.
+    # A note if the errors of mass and inertia allow a material, and no stated mass determines it.
+    # Bodies as dense in the URDF are left out.
     if not fit.is_consistent:
         return
     size = fit.model.layout.n_inertial
@@ -440,9 +437,7 @@ def _unlike(name: str, unlike: UnlikeRun, others: int, rest: str) -> Finding:
 
 def rescaled_findings(fit: Fit, loaded: Collection[str] = ()) -> Iterator[Finding]:
     """Yield a finding for each torque of a validation log that is a multiple of its prediction."""
-    # The factor c minimises |tau - c tau_predicted| over the rows used. It is reported if the
-    # torque error is above the limit of a good prediction, and the factor removes most of its
-    # square.
+    # The c of least |tau - c tau_predicted| of a poor prediction must remove most of its square.
     if fit.model.constraints:  # the rows are projected, and mix the joints
         return
     friction = dict[str, float]()

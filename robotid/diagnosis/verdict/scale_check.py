@@ -26,8 +26,9 @@ _POSES = 300  # at which gravity is compared
 _LOADED = 0.02  # share of the largest gravity torque above which a joint is compared
 _HELD_BACK = 1.5  # residual over that of WLS beyond which the prior determines the result
 _ANOTHER = 0.35  # difference of gravity and total mass from which on they contradict the scale
-_CLEARLY = 4.0  # distance of a common factor from 1 over the share of gravity that it leaves, ...
-_BETTER = 0.5  # ... and the largest ratio of that share to the one that a payload leaves
+# Distance of a common factor from 1 over the share of gravity that it leaves, and largest ratio of
+# that share to the one that a payload leaves.
+_CLEARLY, _BETTER = 4.0, 0.5
 _TOTAL = "total mass"
 _ABSORBS = 0.1  # share of a change of a stated mass that a link takes up to be named
 
@@ -74,9 +75,7 @@ class StatedMass(KnownMass):
     """Masses that the user states, and what torque alone determines of them."""
 
     names: tuple[str, ...]  # "total_mass", or "mass of" a link
-    #: Mass that torque alone determines, without this statement and without the URDF's masses, over
-    #: the stated mass [-]; None if torque does not determine it.
-    ratio: float | None = None
+    ratio: float | None = None  # mass that torque alone determines, over the stated one [-]
     half_width: float = 0.0  # of its 95 % interval, plus that of the stated range [-]
     absorbed_by: tuple[str, ...] = ()  # links that take up the mass while no torque changes
     kind: ClassVar[str] = "stated mass"
@@ -161,20 +160,15 @@ class ScaleCheck:
     masses: tuple[float, float, float] = (0.0, 0.0, 0.0)
     stated: StatedMass | None = None
     payloads: tuple[PayloadCheck, ...] = ()  # that with the narrowest interval first
-    #: Whether torque alone determines the total mass within 5 %, so that a measured one verifies
-    #: the scale.
-    is_total_determined: bool = False
+    is_total_determined: bool = (
+        False  # within 5 % by torque alone: a measured one verifies the scale
+    )
     friction: Mapping[str, float] = field(default_factory=dict)  # its share of each torque [-]
-    #: Whether the result fits the data about as well as WLS. A result that its prior determines
-    #: agrees with the URDF whatever the sensors measured.
-    follows: bool = True
-    #: Factor common to the ratios of the joints, and half the width of its 95 % interval [-], as
-    #: errors of the URDF spread the ratios; None with fewer than two.
+    follows: bool = True  # the data, about as well as WLS, and not the prior
+    #: Factor common to the joints' ratios and its 95 % half-width [-]; None with fewer than two.
     common: tuple[float, float] | None = None
     mass_error: float = 0.0  # standard error of the identified total mass [kg]
-    #: Number of links whose inertials are assumed, so that gravity and mass of the URDF are no
-    #: evidence.
-    assumed: int = 0
+    assumed: int = 0  # number of links with assumed inertials: the URDF is no evidence
 
     @property
     def agrees(self) -> bool:
@@ -186,8 +180,7 @@ class ScaleCheck:
     @property
     def contradicts(self) -> bool:
         """Whether a known mass, or else gravity and total mass of the URDF, contradict it."""
-        # A difference that errors of the URDF's links explain contradicts nothing, nor does a total
-        # mass whose interval includes that of the URDF.
+        # Errors of the URDF's links may explain it, or the interval of a total mass contain it.
         if self._decisive:
             return any(check.contradicts for check in self._decisive)
         if self.has_one_factor:
@@ -331,9 +324,7 @@ class ScaleCheck:
 
 def check_scale(fit: Fit) -> ScaleCheck:
     """Compare gravity and masses of a result with the URDF's."""
-    # With g_u and g the gravity torques of the URDF and of the result over the fitted poses, a
-    # joint's ratio is g_u . g / g_u . g_u. It is linear in the base parameters: the covariance of
-    # the result gives its standard error.
+    # A joint's ratio is g_u . g / g_u . g_u, with gravity torques g_u of the URDF, g of the result.
     model, size = fit.model, fit.model.layout.n_inertial
     before, after = (float(pi[:size:10].sum()) for pi in (fit.prior, fit.standard))
     errors = [fit.metrics(name).per_joint for name in ("estimate", "wls")]
@@ -397,11 +388,9 @@ def check_scale(fit: Fit) -> ScaleCheck:
 
 def common_factor(ratios: Array, sensitivity: Array, inertial: Array) -> tuple[float, float]:
     """Return the factor common to the gravity torques of joints, and its 95 % half-width [-]."""
-    # A scale s of all torques and relative errors of the URDF's links give ratios r = s (1 + E e):
-    # e are errors of mass and of the centre of mass, over the link's radius of gyration;
-    # independent, of one unknown standard deviation. Generalised least squares with the covariance
-    # E E^T gives s; the residual gives the deviation, Student's t with one degree of freedom less
-    # than joints the interval. Errors of the data spread the ratios, too, and are included so.
+    # Ratios r = s (1 + E e), with independent errors e of mass and of the centre of mass over the
+    # radius of gyration, of one unknown deviation: generalised least squares with E E^T, Student's
+    # t with one degree of freedom less than joints. Errors of the data spread the ratios, too.
     A, pi = sensitivity.reshape(len(ratios), -1, 10), inertial.reshape(-1, 10)
     second = np.trace(pseudo_inertia(inertial)[:, :3, :3], axis1=1, axis2=2)
     # mass times radius of gyration
@@ -463,8 +452,8 @@ def _are_masses(fit: Fit) -> Array:
 
 def _checked(fit: Fit, names: Sequence[str], C: Array, widths: Array) -> StatedMass:
     """Return what torque alone determines of the ratio r in C pi = r 1."""
-    # Torque alone determines K pi = beta. Sums Z^T C of the claims that are sums M K of base
-    # parameters have no free part; with o = Z^T 1, r = o . M beta / o . o. In units of the spread.
+    # Torque determines K pi = beta. Sums Z^T C of the claims that are sums M K have no free part;
+    # with o = Z^T 1, r = o . M beta / o . o. In units of the spread.
     model, wls = fit.model, fit.wls
     is_pinned = model.layout.owned_by(fit.estimator.bounds.pinned)
     spread = np.where(fit.prior_std > 0, fit.prior_std, model.layout.scales(model.length))

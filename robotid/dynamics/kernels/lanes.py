@@ -1,14 +1,12 @@
 """Vectors of eight states, work spaces of them, and vector algebra, compiled by Numba.
 
 Imported only where compiled code is used, since importing Numba takes time. Numba stores the
-compiled code in the folder ``__pycache__`` beside this file or, if that is not writable, in its own
-folder in the user's cache; the environment variable ``NUMBA_CACHE_DIR`` sets another one.
+compiled code in ``__pycache__`` beside this file, else in the user's cache or ``NUMBA_CACHE_DIR``.
 
 Compiled code computes ``LANES`` states together, one in each lane. Vectors have the operators of
-numbers, by which a kernel reads like one of numbers; a comparison returns a mask for ``where``.
-Numba alone would compute one lane after the other, since it cannot show that an entry written is
-not one that the next lane reads. An entry ``at`` of a work space is one quantity of all lanes,
-adjacent in memory: ``get`` reads it as a vector, ``put`` writes it.
+numbers; a comparison returns a mask for ``where``. Numba alone would compute one lane after the
+other, since it cannot show that an entry written is not one that the next lane reads. An entry
+``at`` of a work space is one quantity of all lanes, adjacent in memory, for ``get`` and ``put``.
 """
 
 import math
@@ -228,12 +226,9 @@ def work_space(entries: int) -> Array:
 
 
 def compiled(function: Any) -> Any:
-    """Compile without the interpreter's lock; contract: a b + c may be rounded once.
-
-    Only compiled code may call a function whose name begins with an underscore: it has no entry for
-    the interpreter. These entries, and those for C, take a fifth of the time of compilation.
-    """
+    """Compile without the interpreter's lock, and without an entry for it after an underscore."""
     is_private = function.__name__.startswith("_")
+    # entries take a fifth of the time of compilation
     entries = {"no_cfunc_wrapper": True, "no_cpython_wrapper": is_private}
     return _cached(njit, function, nogil=True, **entries)
 

@@ -1,9 +1,8 @@
 """One compiled tree of bodies: motions, inverse dynamics, mass matrix, derivatives, regressor rows.
 
-Spatial vectors are pairs, of motion (linear, angular) and of force (force, moment), in the frame of
-a body, in six adjacent entries of a work space. The entries of the world come first, then those of
-each body, ``BODY`` entries each. ``FRAME`` entries of a body are its placement in its parent, its
-velocity and its acceleration; the world's acceleration is the negative of gravity.
+Spatial vectors are pairs, (linear, angular) and (force, moment), in the frame of a body, in six
+adjacent entries of a work space: ``BODY`` entries of the world, then of each body. Its ``FRAME``
+entries are its placement in its parent, velocity and acceleration; the world's is minus gravity.
 
     V_i = X^-1 V + s v_i,    A_i = X^-1 A + s a_i + V_i x s v_i    from those of the parent.
 
@@ -25,10 +24,7 @@ d = a + w x v minus gravity, B = [dw]x + [w]x [w]x and N I = I dw + w x I w, it 
     s_j . f_i = u . (m d + B mc) + e . (mc x d + N I).
 
 The gradient of rows is computed backwards (reverse mode, by hand): ``pull``s are the adjoints of
-motions. They are spatial forces and are transformed like these.
-
-References:
-    Featherstone (2008), Rigid Body Dynamics Algorithms, chapters 2, 5 and 6.
+motions, spatial forces. See Featherstone (2008), Rigid Body Dynamics Algorithms, 2, 5 and 6.
 """
 
 import numpy as np
@@ -280,10 +276,7 @@ def _join_bodies(work, own, up):
 
 @compiled
 def _change_motion(work, own, up, joint, v, is_first, is_speed):
-    """Write the derivatives of a body's velocity and acceleration by a position or speed.
-
-    It is that of its own joint if the body is the first one that changes.
-    """
+    """Write the derivatives of a body's motion by a position or speed, its own joint's if first."""
     s = axis(joint)
     V, A = get6(work, own + VELOCITY), get6(work, own + ACCELERATION)
     if is_first and is_speed:
@@ -319,10 +312,7 @@ def _clear(work, at):
 
 @compiled
 def derivatives(work, tree, bodies, v, T):
-    """Write the derivatives of the torques by positions and speeds, after inverse dynamics.
-
-    T[i, k] = d tau_i / d q_k; n^2 entries further is d tau_i / d v_k.
-    """
+    """Write T[i, k] = d tau_i / d q_k, then d tau_i / d v_k, after inverse dynamics."""
     n = len(tree.parents)
     for kind in range(2):
         for k in range(n):
@@ -534,10 +524,7 @@ def _pull_row(work, own, at, pull, pulls):
 
 @compiled
 def _pull_joint(work, own, joint, axes, pull, pulls, above):
-    """Write the derivatives by q, v and a of a joint in their places, and update the adjoints.
-
-    The updated adjoints are those of the parent's velocity and acceleration in the body's frame.
-    """
+    """Write the derivatives by q, v, a of a joint; the adjoints become those of its parent here."""
     s = axis(joint)
     V, A = get6(work, own + VELOCITY), get6(work, own + ACCELERATION)
     by_V, by_A = get6(work, pulls), get6(work, pulls + 6)

@@ -1,9 +1,8 @@
 """Closed-loop simulation of a robot with sensitivities, in Numba: the steps and the drives' laws.
 
-Imported only for closed-loop simulations. ``LANES`` windows of logs are simulated together, one in
-each lane of the work space of ``tree_lanes``, each from the initial state of its window.
-
-One step solves for the speed u at the instant t + theta dt
+``LANES`` windows of logs are simulated together, one in each lane of the work space of
+``tree_lanes``, each from the initial state of its window. One step solves for the speed u at the
+instant t + theta dt
 
     D (u - v) / (theta dt) + h(q', v) + f(q', u) = kp (r - q - theta dt u) + kd (w - u) + ff,
 
@@ -16,15 +15,10 @@ Torques of gravity and speeds are exact to first order. ``corrects`` solves each
 with M and h at the midpoint q + theta dt u of the first solution: exact to second order, except
 where friction reverses within the step. Such roll-outs have no sensitivities.
 
-Presliding friction x z has the bristle deflection z as a further state. Over a step, at the speed
-u, its equation is linear and solved exactly. The torque is that of z at t + theta dt.
-
-A discrete-time controller samples q, v and its commands at its ticks, and has a zero-order hold of
-the torque. No step crosses a tick. The held torque has its own sensitivities, which change only at
-ticks.
-
-Friction has the laws of the terms of ``drives``, compiled one by one; the code here calls a law by
-its address. ``drive`` has armature, kp, kd and torque limit.
+The bristle deflection z of presliding friction x z is a further state; over a step its equation is
+linear and solved exactly. The torque is that of z at t + theta dt. A discrete-time controller
+samples q, v and commands at its ticks, which no step crosses, with a zero-order hold of the torque.
+Friction has the laws of ``drives``, compiled one by one and called by address.
 """
 
 import math
@@ -172,8 +166,7 @@ def places_of(n: int, P: int, n_bristles: int, is_held: bool) -> tuple[Places, A
 def _balance(work, at, robot, step, now):
     """Write the residual G of a step's equation for the speeds u, and its derivative H.
 
-    Row i is divided by e = 1 + mu s(u) sign(tau), the factor of the bodies' torque tau in a gear
-    with friction mu |tau|, so that H is symmetric.
+    Rows are divided by e = 1 + mu s(u) sign(tau) of gears with friction mu |tau|: H is symmetric.
     """
     n, drives, terms = at.n, robot.drives, robot.terms
     codes, shapes, values, spans, _ = terms
@@ -252,10 +245,7 @@ def _add_fall(work, at, terms):
 
 @compiled
 def _newton(work, at, robot, step, now, is_cautious):
-    """Iterate Newton's method for ``_solve``, without falling friction in H if cautious.
-
-    Friction is nonlinear at speed 0, so a Newton step that would cross it ends there.
-    """
+    """Iterate Newton's method for ``_solve``, without falling friction in H if cautious."""
     for k in range(_NEWTON):
         share = 1.0 if k < _NEWTON // 4 else 0.5  # against cycles of several joints' friction
         _balance(work, at, robot, step, now)
@@ -267,7 +257,7 @@ def _newton(work, at, robot, step, now, is_cautious):
         for i in range(at.n):
             before = get(work, at.u + i)
             after = before - share * get(work, at.G + i)
-            halts = after * before < 0.0
+            halts = after * before < 0.0  # at speed 0, where friction is nonlinear
             after = where(halts, 0.0, after)
             is_close = abs(after - before) <= _CLOSE * (1.0 + abs(after))
             is_found = is_found and not is_any(halts | ~is_close)
@@ -334,10 +324,7 @@ def _presliding(work, at, terms, span):
 
 @compiled
 def _advance_bristles(work, at, terms, span, step):
-    """Write z after a step, the acting z a time after its start, and derivatives of both.
-
-    The derivatives are: of the acting z by z before; of z after by the speed u, and by z before.
-    """
+    """Write z after a step, the z that acts, and d acting / d before, d after / d u, d before."""
     for slot in range(len(terms.bristles)):
         x, speed = terms.shapes[terms.bristles[slot, 0]], get(work, at.u + terms.bristles[slot, 1])
         z = at.bristles + 5 * slot
@@ -544,8 +531,8 @@ def roll_out(robot, columns, course, out, work, at, corrects):
 def coded_term(term: DriveTerm) -> tuple[tuple[int, ...], tuple[float, ...]]:
     """Return a term for ``term`` and ``deflection``: five codes and eleven numbers.
 
-    The codes are the addresses of its laws of speed and position (0 without one), its kind, and the
-    counts of their shape parameters; the numbers four of these for each law, and the ranges.
+    Addresses of its laws of speed and position (or 0), kind, counts of shape parameters; numbers:
+    four of these for each law, and the ranges.
     """
     if isinstance(term, Bristles):
         return (0, 0, BRISTLES, 0, 0), (*term.numbers, *[0.0] * 8)
@@ -648,10 +635,7 @@ def deflection_by_lane(x, before, u, span):
 
 @compiled
 def initial_deflection(x, v, time):
-    """Return the deflection z of a drive that has moved for a time, and its derivative by speed.
-
-    It is that of steady sliding, unless the drive needs more time for its displacement.
-    """
+    """Return z after a time of motion, at most that of steady sliding, and its derivative by v."""
     g, g_v, _ = _bristles(x, 0.0, v)
     s, s_v = direction(v, x[0] / time)
     return s * g, s_v * g + s * g_v
@@ -722,10 +706,7 @@ def average_command(stamps, values, times, delay, mean, change):
 
 @compiled
 def divide_rows(stamps, ticks, times, is_tick):
-    """Write the ends of the steps: an equal number in each row, and none across a tick.
-
-    Ticks divide a row; the longest steps are divided further until the row has the number.
-    """
+    """Write the ends of the steps: an equal number in each row, none across a tick."""
     every, i = len(is_tick) // (len(stamps) - 1), 0
     edges, shares = np.empty(every + 1), np.empty(every, np.int64)
     is_tick[:], is_tick[0] = False, True
@@ -740,7 +721,7 @@ def divide_rows(stamps, ticks, times, is_tick):
             i += 1
         edges[count] = stamps[k + 1]
         shares[:count] = 1
-        for _ in range(every - count):
+        for _ in range(every - count):  # the longest step is divided further
             longest, length = 0, 0.0  # np.argmax and np.diff take three seconds to compile
             for j in range(count):
                 step = (edges[j + 1] - edges[j]) / shares[j]

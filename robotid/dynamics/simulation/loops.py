@@ -1,8 +1,7 @@
 """Closed-loop simulation of windows of logs, with sensitivities.
 
-A robot with a fixed base consists of parts that only the base joins, such as the legs of a
-quadruped; each part is simulated independently. The lanes of the compiled code simulate several
-windows in parallel.
+Parts of a robot that only its fixed base joins, such as legs, are simulated independently. The
+lanes of the compiled code simulate several windows in parallel.
 """
 
 import math
@@ -45,11 +44,10 @@ _FASTEST = 1e6  # speed above which a closed loop is unstable [rad/s or m/s]
 class Loops:
     """Parameters of bodies, drives and the drives' control loops.
 
-    torque = kp (q_ref - q) + kd (v_ref - v) + tau_ref, at most ``limit``, with commands delayed by
-    ``delay``; position 0 of a joint's encoder is position ``zero`` of the URDF. With a ``rate``,
-    the controller samples all signals at its ticks, with a zero-order hold of the torque. Ticks are
-    counted from the first row of a log. A command at a tick is averaged over the row after the
-    tick, so that a delay of part of a row interpolates between whole rows.
+    torque = kp (q_ref - q) + kd (v_ref - v) + tau_ref, at most ``limit``, of delayed commands;
+    position 0 of an encoder is position ``zero`` of the URDF. With a ``rate``, the controller
+    samples at its ticks, counted from the first row of a log, with a zero-order hold. A command at
+    a tick is averaged over the row after it: a delay of part of a row interpolates between rows.
     """
 
     bodies: Array  # ten inertial parameters of each body, shape (n, 10), in the order of the layout
@@ -110,7 +108,7 @@ class Window:
     def _near(self) -> slice:
         """The samples about the first one."""
         wide = max(_FEWEST, round(_AROUND / self.dt))
-        return slice(max(self.start_row - wide, 0), min(self.start_row + wide + 1, len(self.log.t)))
+        return slice(max(self.start_row - wide, 0), self.start_row + wide + 1)
 
     @cached_property
     def dt(self) -> float:
@@ -241,10 +239,7 @@ class ClosedLoopRobot:
         along: Array,
         outputs: int,
     ) -> tuple[Array, Array, Array, Array]:
-        """Return sensitivities, positions, speeds and derivatives of a part in a block of windows.
-
-        ``wanted`` has a row for each column: kind, joint, index, and index of the sensitivity.
-        """
+        """Return numbers, positions, speeds and derivatives; wanted: kind, joint, index, number."""
         lanes, own, n = _lanes(), part.joints, len(part.joints)
         columns = wanted[np.isin(wanted[:, 1], own)]
         numbers, first = np.unique(columns[:, 3], return_index=True)
@@ -366,10 +361,7 @@ def _parts(tree: Tree) -> list[_Part]:
 
 
 def _arranged(loops: Loops, joints: Array) -> tuple[Array, "Terms", Array]:
-    """Return the indices in ``loops.values`` of the terms of joints, joint by joint, and the terms.
-
-    Also, for each joint, the sums of its affine terms: constant, by the speed, by its direction.
-    """
+    """Return indices in ``loops.values`` of joints' terms, these, sums of affine ones (n, 3)."""
     lanes, first = _lanes(), np.cumsum([0, *map(len, loops.terms)])
     places, spans, affine = list[int](), [], np.zeros((len(joints), 3))
     for i, j in enumerate(joints):
@@ -403,10 +395,7 @@ def _lanes() -> ModuleType:
 def _failed_at(
     row: int, last: tuple[Array, Array] | None, q: Array, v: Array
 ) -> tuple[int, int, int, Array]:
-    """Return row, lane and joint of a failed roll-out, and the positions in this lane, shape (n,).
-
-    The positions of an unstable one are the initial ones: q and v (N, n, LANES).
-    """
+    """Return row, lane and joint of a failed roll-out, and positions (n,); unstable: initial."""
     if last is None:
         is_fast = ~(np.abs(v) < _FASTEST)
         row, i, lane = (int(k) for k in np.unravel_index(np.argmax(is_fast), v.shape))
@@ -426,7 +415,10 @@ def why_no_solution(
         return _slow_rate(loops, loops.rate, [model.joints[j] for j in joints], joints, M)
     for j, angle in zip(joints, q, strict=True):
         if why := _wrong_friction(model, loops, j, angle):
-            return why
+            return (
+                f"the simulation of {model.joints[j]} has no solution: {why}. Set other friction "
+                f"terms of {model.joints[j]} in [drives]"
+            )
     name, kp, inertia = model.joints[joints[last]], float(loops.kp[joints[last]]), M[last, last]
     return (
         f"the simulation of {name} has no solution in steps of {step:g} s: its gain kp is {kp:.3g} "
@@ -438,24 +430,18 @@ def why_no_solution(
 
 def _wrong_friction(model: RobotModel, loops: Loops, j: int, angle: float) -> str:
     """Return which friction of a joint makes its motion impossible or ambiguous; else ""."""
-    name = model.joints[j]
     for term in loops.terms[j]:
         value = float(loops.values[loops.place(j, term)])
         is_negative = term.is_nonnegative and value < 0.0
         if is_negative or value > term.highest:
             wanted = "0 or more" if is_negative else f"at most {term.highest:g}"
-            return (
-                f"the simulation of {name} has no solution: {name}.{term.name} is {value:.3g}, "
-                f"wanted {wanted}. Set other friction terms of {name} in [drives]"
-            )
+            return f"{model.joints[j]}.{term.name} is {value:.3g}, wanted {wanted}"
     at_rest = float(friction_at_rest(loops, j, np.array([angle]))[0])
     if at_rest >= 0.0:
         return ""
     unit, force = ("m", "N") if model.limits[j].type == "prismatic" else ("rad", "N m")
-    return (
-        f"the simulation of {name} has no solution: its Coulomb friction is {at_rest:.3g} {force} "
-        f"at {angle:.3g} {unit}, wanted 0 or more. Set other friction terms of {name} in [drives]"
-    )
+    stated = f"{at_rest:.3g} {force} at {angle:.3g} {unit}"
+    return f"its Coulomb friction is {stated}, wanted 0 or more"
 
 
 def friction_at_rest(loops: Loops, j: int, q: Array) -> Array:

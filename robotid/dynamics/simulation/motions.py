@@ -32,13 +32,6 @@ class FourierTrajectory(Motion):
     cosine: Array  # coefficients c_k, shape (h, n) [rad or m]
     period: float  # [s]
 
-    def __post_init__(self) -> None:
-        if self.sine.shape != self.cosine.shape or self.sine.shape[1:] != self.q0.shape:
-            raise DataError(
-                f"sine has shape {self.sine.shape} and cosine {self.cosine.shape}, wanted the same "
-                f"shape (h, {len(self.q0)})"
-            )
-
     def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
         w = 2 * np.pi / self.period * np.arange(1, len(self.sine) + 1)  # (h,)
         sin, cos = np.sin(np.outer(t, w)), np.cos(np.outer(t, w))  # (N, h)
@@ -69,10 +62,7 @@ class ProgramMotion(Motion):
             raise SettingsError(f"duration is {self.duration}, wanted a positive number")
 
     def evaluate(self, t: Array | float) -> tuple[Array, Array, Array]:
-        """Return q, v and a as in ``Motion``, each of shape t.shape + (n,), or (R, n).
-
-        t (R,) [s].
-        """
+        """Return q, v and a as in ``Motion``, each of shape t.shape + (n,), or (R, n): t (R,)."""
         A, T = np.asarray(self.amplitude, dtype=float), np.asarray(self.duration)[..., None]
         s = np.clip(np.asarray(t, dtype=float)[..., None] / T, 0.0, 1.0)  # t / T
         q = self.start + A * (6 * s**5 - 15 * s**4 + 10 * s**3)

@@ -147,11 +147,6 @@ class Actuator(Settings):
                 "example stiffness = 2e4 [N m/rad]"
             )
 
-    @property
-    def is_elastic(self) -> bool:
-        """Whether motors and joints have separate positions."""
-        return self.stiffness is not None
-
 
 @dataclass(frozen=True)
 class Noise(Settings):
@@ -247,9 +242,9 @@ class Simulation(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.controller.kind == "perfect" and (
-            self.actuator.is_elastic or self.actuator.effort is not None or self.actuator.limits
-        ):
+        is_limited = self.actuator.effort is not None or bool(self.actuator.limits)
+        is_ideal = self.actuator.stiffness is None and not is_limited
+        if self.controller.kind == "perfect" and not is_ideal:
             raise SettingsError(
                 "controller: kind is perfect, which has no limits and no elastic gears. Leave out "
                 "[actuator], or set kind to feedforward, pd or computed_torque"

@@ -98,9 +98,8 @@ def follow(
 ) -> Run:
     """Return the exact motion of a robot, a ``RobotPlant``, that tracks a motion.
 
-    An elastic gear has the motor angle th and the torque tau = k dead(th - q) + d (w - v); rotor
-    and friction are then on the motor's side. The integrator is a Rosenbrock W-method of order 3,
-    which is stable with stiction (Rang, Angermann 2005, New Rosenbrock W-methods).
+    With elastic gears, rotor and friction are on the motor's side. The Rosenbrock W-method of order
+    3 is stable with stiction (Rang, Angermann 2005, New Rosenbrock W-methods).
     """
     _check_size(duration * rate, 1)
     t = np.arange(round(duration * rate) + 1) / rate
@@ -244,11 +243,9 @@ class Friction:
 class RobotPlant:
     """The plant M(q) a + b(q, v) + Ia a + Fv v + Fc sign(v) + off = u of a robot.
 
-    The drives have the terms of the model. sign(v) is tanh(v / 0.2 mm/s), so that it can be
-    integrated. Drives that couple several joints load all of them. Load-dependent friction uses the
-    load of the same instant. The bristle deflection z of presliding is a state of the plant with
-    the rate of ``bristle_rate``; if it is not given, sliding is steady. A delay of the torque
-    (``Lag``) is one of the measurement, not of the plant. q, v, u are of shape (n,), pi (p,).
+    The drives have the terms of the model; sign(v) is tanh(v / 0.2 mm/s). Load-dependent friction
+    uses the load of the same instant. The bristle deflection z is a state with ``bristle_rate``; if
+    it is not given, sliding is steady. A ``Lag`` is one of the measurement. q, v, u (n,), pi (p,).
     """
 
     def __init__(self, model: RobotModel, pi: Array) -> None:
@@ -410,7 +407,9 @@ class _Loop:
         self.limit = np.where(np.isnan(limits), urdf, limits)  # [N m or N]
         self.has_limits, self.n = bool(np.isfinite(self.limit).any()), len(model.joints)
         self.is_at_motor = settings.sensors.side == "motor"
-        self.gear = _Gear(plant, settings.actuator) if settings.actuator.is_elastic else None
+        self.gear = (
+            _Gear(plant, settings.actuator) if settings.actuator.stiffness is not None else None
+        )
         self.longest_step = self._longest_step()
 
     def start(self, q: Array, v: Array, a: Array) -> Array:
@@ -464,10 +463,7 @@ class _Loop:
         return np.stack([q, v, f[(side + 1) * self.n : (side + 2) * self.n], tau])
 
     def damped(self, y: Array, h: float, F: Friction) -> Callable[[Array, Array], Array]:
-        """Return (f, s) -> (1 - g h J)^-1 (f + h J s), with g of the method and J of friction.
-
-        J uses the chord of friction over speed, F(w) / w, and the rate of presliding.
-        """
+        """Return (f, s) -> (1 - g h J)^-1 (f + h J s), J of the chord F(w) / w and of bristles."""
         q, v, motor, w, z = self._parts(y)
         n, load = self.n, np.zeros(self.n)
         if self.plant.is_loaded and self.gear is None:
@@ -524,7 +520,7 @@ def _advance(loop: _Loop, y: Array, wanted: Array, h: float, F: Friction, f: Arr
 
 
 class _Gear:
-    """Springs with backlash between motors and joints."""
+    """Springs with backlash between motors and joints, k dead(motor - q) + d (w - v)."""
 
     def __init__(self, plant: RobotPlant, actuator: Actuator) -> None:
         joints = plant.model.joints
@@ -599,10 +595,7 @@ def measure(
     *,
     delay: Array | float = 0.0,
 ) -> Log:
-    """Return the log of a robot's motion by sensors, its torques with a delay (n,) [s].
-
-    Delay, noise and rounding are applied in this order. Jitter changes only the time stamps.
-    """
+    """Return the log of a motion by sensors: delay (n,) [s], then noise, then rounding."""
 
     def of(value: PerJoint, name: str) -> Array:
         return by_joint(value, joints, f"sensors: {name}")

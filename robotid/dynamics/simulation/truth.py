@@ -42,10 +42,8 @@ def draw_parameters(model: RobotModel, settings: Truth, rng: np.random.Generator
 def perturbed_bodies(model: RobotModel, size: float, rng: np.random.Generator) -> Array:
     """Return inertial parameters of bodies near the model's, shape (10 bodies,).
 
-    For each body J' = J^1/2 exp(S) J^1/2. S is symmetric and normal, with ten independent
-    coordinates of equal standard deviation in the metric d^2 = 1/2 tr(log(J^-1 J')^2) (Wensing,
-    Kim, Slotine 2018; Lee, Park 2018, (13)). J' is positive definite if J is, whatever the frame,
-    units or body.
+    J' = J^1/2 exp(S) J^1/2 of each body; S is symmetric, with ten independent normal coordinates in
+    the metric d^2 = 1/2 tr(log(J^-1 J')^2) (Wensing, Kim, Slotine 2018; Lee, Park 2018, (13)).
     """
     bodies = model.standard_parameters()[: model.layout.n_inertial]
     if size == 0.0:
@@ -70,11 +68,7 @@ def perturbed_bodies(model: RobotModel, size: float, rng: np.random.Generator) -
 
 
 def another_robot(model: RobotModel, rng: np.random.Generator) -> Array:
-    """Return standard parameters, shape (p,), of a robot that differs from the model.
-
-    Masses differ by 10 to 30 % in either direction, the last link has an additional mass of 1.2 kg
-    at 10 cm from its joint, and the drives have armature and friction.
-    """
+    """Return parameters (p,) of a robot with other masses (10 to 30 %), a tool, and friction."""
     size = model.layout.n_inertial
     pi = model.standard_parameters()
     by_body = pi[:size].reshape(-1, 10)
