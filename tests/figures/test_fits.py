@@ -127,7 +127,7 @@ def test_the_written_robot_has_the_torque_of_the_estimate(ran):
     wanted = regressor_torque(hoist, values, q, v, a)
     for file in ("out/hoist.identified.urdf", "x.urdf"):
         text = (runs.folder / file).read_text()
-        model = Hoist(text=text, gravity=hoist.gravity).model()
+        model = Hoist(text=text, bodies={}, gravity=hoist.gravity).model()
         data = model.createData()
         place = np.column_stack([q[:, :3], np.cos(q[:, 3]), np.sin(q[:, 3])])
         tau = [pin.rnea(model, data, *state) for state in zip(place, v, a, strict=True)]

@@ -31,13 +31,7 @@ def arm():
 
 
 def driven(model, own, values):
-    """Return a robot near the model whose drives have further terms, and its parameters.
-
-    Args:
-        model: The robot.
-        own: Further terms by joint.
-        values: Parameters of these, and of others, by name.
-    """
+    """Return a robot near the model with further terms by joint, values by name; its parameters."""
     model = model.with_terms(own)
     pi = another_robot(model, np.random.default_rng(0))
     names = list(model.layout.names)
@@ -49,18 +43,10 @@ def driven(model, own, values):
 def driven_log(
     model, pi, seed, *, duration=30.0, rate=60.0, noise=0.01, reach=1.0, speed=1.0, still=()
 ):
-    """Return a log of inverse dynamics, those of what drives remember among them.
+    """Return a log of inverse dynamics, of what drives remember, too.
 
-    Args:
-        model: The robot, its reference the parameters.
-        pi: Its parameters.
-        seed: Of motion and noise.
-        duration: Length [s].
-        rate: Rate [Hz].
-        noise: Of each torque, share of its typical size.
-        reach: Times how far a random motion goes.
-        speed: Times how fast it is.
-        still: Numbers of joints that stand.
+    The model's reference are its parameters pi. Noise is the share of each torque's typical size;
+    reach and speed are factors of a random motion; ``still`` numbers joints that stand.
     """
     rng = np.random.default_rng(seed)
     motion = _Scaled(random_fourier(model, rng, period=duration / 3), reach, speed, still)

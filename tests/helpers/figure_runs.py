@@ -10,16 +10,15 @@ from dataclasses import replace
 import numpy as np
 
 from helpers.hoist import (
-    BODIES,
     DRIVES,
     NOISE,
+    URDF,
     Drive,
     Hoist,
     Loop,
     follow,
     motion,
     record,
-    urdf,
     write_table,
 )
 from helpers.stored import HERE, Runs
@@ -32,7 +31,7 @@ ROBOT = "--joints lift,reach,roll --lock finger=0.02 --lock swing=0.4"
 
 def begun(folder, job=""):
     """Return the runs of a folder with the URDF, and a job of tests/figures/jobs."""
-    (folder / "hoist.urdf").write_text(urdf())
+    (folder / "hoist.urdf").write_text(URDF)
     if job:
         (folder / "job.toml").write_text((HERE / "jobs" / f"{job}.toml").read_text())
     return Runs(folder)
@@ -294,7 +293,7 @@ LOOP_STEP = 5e-4  # [s] semi-implicit: torques act half of it early
 def commands(folder):
     """A robot that follows commands: loops fitted, judged, shown and exported; then by torque."""
     joints, step = ("lift", "reach"), LOOP_STEP
-    hoist = Hoist(joints, bodies=BODIES, drives=LOOP_DRIVES, locked=PAIR_STILL, gravity=LEVEL)
+    hoist = Hoist(joints, bodies={}, drives=LOOP_DRIVES, locked=PAIR_STILL, gravity=LEVEL)
     runs = begun(folder, "commands")
     for name, seed, seconds, rate, start in (
         ("one", 51, 4, 200, 3.8), ("two", 52, 1.9, 250, 0.4), ("three", 53, 3, 200, 70.0),
@@ -418,11 +417,14 @@ def faults(folder):
         stated = "--torque-delay 0.012" if name == "late" else ""
         line = f"doctor @hoist.urdf @{name}_71.csv @{name}_72.csv {ROBOT} {stated} --json"
         runs.run(name, line, code=None)
-    wrong = BODIES | {
-        "boom": (4.0, (0.9, 0.01, 0.02), (0.02, 0.12, 0.19)),
-        "hand": (90.0, (0.0, 0.0, 0.1), (0.6, 0.7, 0.3)),
-    }
-    (folder / "wrong.urdf").write_text(urdf(wrong))
+    wrong = URDF
+    for old, new in (
+        ('"0.22 0.01 0.02"', '"0.9 0.01 0.02"'), ('izz="0.13"', 'izz="0.19"'),
+        ('"0.03 0.02 0.09"', '"0 0 0.1"'), ('mass value="1.2"', 'mass value="90"'),
+        ('ixx="0.006"', 'ixx="0.6"'), ('iyy="0.007"', 'iyy="0.7"'), ('izz="0.003"', 'izz="0.3"'),
+    ):  # fmt: skip
+        wrong = wrong.replace(old, new)
+    (folder / "wrong.urdf").write_text(wrong)
     runs.run("inspect wrong", "inspect @wrong.urdf --verbose")
     runs.run("inspect", "inspect @hoist.urdf --base --json")
     runs.run("inspect floating", "inspect @hoist.urdf --free-flyer --base")

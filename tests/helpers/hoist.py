@@ -5,79 +5,22 @@ Nothing of the package is used: what a scenario is compared with is known from h
 
 import csv
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 
 JOINTS = ("swing", "lift", "reach", "roll")
 LOCKED = {"finger": 0.012}
-#: mass, centre, principal inertias about it: of the URDF, and of the robot that moves
-BODIES = {
-    "post": (6.0, (0.02, -0.01, 0.12), (0.05, 0.06, 0.03)),
-    "boom": (4.0, (0.22, 0.01, 0.02), (0.02, 0.12, 0.13)),
-    "slide": (2.5, (0.15, -0.02, 0.01), (0.01, 0.04, 0.035)),
-    "hand": (1.2, (0.03, 0.02, 0.09), (0.006, 0.007, 0.003)),
-    "jaw": (0.3, (0.0, 0.01, 0.04), (0.0004, 0.0005, 0.0002)),
-}
+URDF = (Path(__file__).parents[1] / "figures" / "hoist.urdf").read_text()
+#: mass, centre, principal inertias about it: of the robot that moves; the URDF says otherwise
 TRUE = {
     "post": (6.5, (0.03, 0.0, 0.14), (0.06, 0.07, 0.034)),
     "boom": (4.6, (0.25, 0.02, 0.01), (0.025, 0.14, 0.15)),
     "slide": (2.1, (0.17, -0.01, 0.015), (0.012, 0.038, 0.034)),
     "hand": (1.5, (0.04, 0.03, 0.11), (0.008, 0.010, 0.004)),
-    "jaw": (0.3, (0.0, 0.01, 0.04), (0.0004, 0.0005, 0.0002)),
 }
 GRAVITY = (1.2, -0.9, -9.6)  # [m/s^2] the hoist stands on a slope
-# name, kind, parent, child, origin, rpy, axis, lower, upper, effort, speed
-_JOINTS = (
-    ("swing", "revolute", "base", "post", (0, 0, 0.3), (0, 0, 0), (0, 0, 1), -2.5, 2.5, 120, 2.0),
-    ("lift", "revolute", "post", "boom", (0.1, 0, 0.25), (0.1, 0, 0), (0, 1, 0), -1.4, 1.2, 150,
-     2.5),
-    ("reach", "prismatic", "boom", "slide", (0.3, 0, 0.05), (0, 0.2, 0), (1, 0, 0), -0.2, 0.3, 90,
-     0.8),
-    ("roll", "continuous", "slide", "hand", (0.35, 0, 0), (0, 1.5, 0), (0, 0, 1), 0, 0, 20, 4.0),
-    ("finger", "prismatic", "hand", "jaw", (0, 0, 0.12), (0, 0, 0), (0, 1, 0), 0.0, 0.03, 10, 0.1),
-)  # fmt: skip
-_BOX = {"base": (0.4, 0.4, 0.3), "post": (0.16, 0.16, 0.5), "boom": (0.7, 0.14, 0.14),
-        "slide": (0.5, 0.1, 0.1), "hand": (0.16, 0.16, 0.26), "jaw": (0.04, 0.06, 0.1)}  # fmt: skip
-
-
-def urdf(bodies=BODIES):
-    """Return the URDF of a hoist with these bodies."""
-    lines = ['<robot name="hoist">', _link("base", None)]
-    lines += [_link(name, body) for name, body in bodies.items()]
-    for name, kind, parent, child, origin, rpy, axis, low, high, effort, speed in _JOINTS:
-        limits = "" if kind == "continuous" else f'lower="{low}" upper="{high}" '
-        lines.append(
-            f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
-            f'<origin xyz="{_words(origin)}" rpy="{_words(rpy)}"/><axis xyz="{_words(axis)}"/>'
-            f'<limit {limits}effort="{effort}" velocity="{speed}"/></joint>'
-        )
-    lines.append(
-        '<link name="tool"/><joint name="flange" type="fixed"><parent link="hand"/>'
-        '<child link="tool"/><origin xyz="0.01 0 0.2" rpy="0 0 0.5"/></joint></robot>'
-    )
-    return "\n".join(lines) + "\n"
-
-
-def _link(name, body):
-    size = _BOX[name]
-    at = (size[0] / 2 - 0.05, 0, 0) if name in ("boom", "slide") else (0, 0, size[2] / 2 - 0.02)
-    shape = f'<origin xyz="{_words(at)}"/><geometry><box size="{_words(size)}"/></geometry>'
-    inertial = ""
-    if body is not None:
-        mass, com, (ixx, iyy, izz) = body
-        inertial = (
-            f'<inertial><origin xyz="{_words(com)}"/><mass value="{mass}"/><inertia ixx="{ixx}" '
-            f'ixy="0" ixz="0" iyy="{iyy}" iyz="0" izz="{izz}"/></inertial>'
-        )
-    return (
-        f'<link name="{name}">{inertial}<visual>{shape}</visual><collision>{shape}</collision>'
-        "</link>"
-    )
-
-
-def _words(values):
-    return " ".join(f"{x:g}" for x in values)
 
 
 @dataclass(frozen=True)
@@ -115,11 +58,14 @@ class Hoist:
     coupling: tuple = ()  # ratios by joint of one more drive
     coupled: Drive = Drive()
     load: tuple = ()  # mass and centre in the tool's frame
-    text: str = ""  # of a URDF in the place of that of the bodies
+    text: str = URDF  # of a URDF, with other bodies
 
     def model(self):
         """Return Pinocchio's model of the joints that move, in their order."""
-        full = pin.buildModelFromXML(self.text or urdf(self.bodies))
+        full = pin.buildModelFromXML(self.text)
+        for link, (mass, com, moments) in self.bodies.items():
+            inertia = pin.Inertia(mass, np.array(com), np.diag(moments))
+            full.inertias[full.getJointId(_LINK[link])] = inertia
         q = pin.neutral(full)
         still = []
         for name, where in self.locked.items():
@@ -238,7 +184,7 @@ def write_table(path, table, scale=None):
 
 
 INERTIAL = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
-_LINK = {child: joint for joint, _, _, child, *_ in _JOINTS}
+_LINK = {"post": "swing", "boom": "lift", "slide": "reach", "hand": "roll"}
 
 
 def parameters(hoist):

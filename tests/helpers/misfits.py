@@ -19,44 +19,10 @@ class Effect:
     torque: object  # function of time, position, speed, rigid torque and typical torque
 
 
-def _stribeck(t, q, v, load, usual):
-    return 0.25 * usual * np.sign(v) * np.exp(-((v / 0.15) ** 2))
-
-
-def _saturating(t, q, v, load, usual):
-    return 0.4 * usual * np.sign(v) * np.cbrt(np.abs(v))
-
-
-def _load(t, q, v, load, usual):
-    return 0.1 * np.sign(v) * np.abs(load)
-
-
-def _periodic(t, q, v, load, usual):
-    return 0.15 * usual * (np.cos(3 * q + 0.4) + 0.7 * np.sin(4 * q))
-
-
-def _ripple(t, q, v, load, usual):
-    return 0.15 * usual * np.cos(13 * q + 0.4)
-
-
-def _harmonic_drive(t, q, v, load, usual):
-    return 0.15 * usual * np.cos(40 * q + 0.4)
-
-
-def _balancing(t, q, v, load, usual):
-    """A counterbalance that takes 40 N m of the lift of a UR5 with its arm stretched out."""
-    return 40.0 * np.cos(q + 0.1)
-
-
-def _spring(t, q, v, load, usual):
-    return 0.3 * usual * (q - 0.2)
-
-
 def _counterbalance(t, q, v, load, usual):
     """A spring between points 0.6 m and 0.15 m from the axis, 0.4 m long at rest."""
     length = np.sqrt(0.6**2 + 0.15**2 + 2 * 0.6 * 0.15 * np.cos(q - 0.5))
-    lever = 0.6 * 0.15 * np.sin(q - 0.5) / length
-    pull = (length - 0.4) * lever
+    pull = (length - 0.4) * 0.6 * 0.15 * np.sin(q - 0.5) / length
     return usual * pull / np.std(pull) * 0.5
 
 
@@ -67,24 +33,31 @@ def _windup(t, q, v, load, usual):
     return -0.4 * usual * np.sign(v) * np.exp(-np.abs(q - q[last]) / 0.05)
 
 
-def _drift(t, q, v, load, usual):
-    return 0.3 * usual * np.sign(v) * (1 - t / t[-1])
+def _of(code, law):
+    """Return an effect in sizes of the typical torque, from time, position and speed."""
+    return Effect(code, lambda t, q, v, load, usual: usual * law(t, q, v))
 
 
 EFFECTS = {
-    "stribeck": Effect("friction_shape", _stribeck),
-    "saturating": Effect("friction_shape", _saturating),
-    "load": Effect("load_friction", _load),
-    "periodic": Effect("position_periodic", _periodic),
-    "ripple": Effect("position_periodic", _ripple),
-    "harmonic drive": Effect("position_periodic", _harmonic_drive),
-    "spring": Effect("spring", _spring),
+    "stribeck": _of(
+        "friction_shape", lambda t, q, v: 0.25 * np.sign(v) * np.exp(-((v / 0.15) ** 2))
+    ),
+    "saturating": _of("friction_shape", lambda t, q, v: 0.4 * np.cbrt(v)),
+    "load": Effect(
+        "load_friction", lambda t, q, v, load, usual: 0.1 * np.sign(v) * np.abs(load)
+    ),
+    "periodic": _of(
+        "position_periodic", lambda t, q, v: 0.15 * (np.cos(3 * q + 0.4) + 0.7 * np.sin(4 * q))
+    ),
+    "ripple": _of("position_periodic", lambda t, q, v: 0.15 * np.cos(13 * q + 0.4)),
+    "harmonic drive": _of("position_periodic", lambda t, q, v: 0.15 * np.cos(40 * q + 0.4)),
+    "spring": _of("spring", lambda t, q, v: 0.3 * (q - 0.2)),
     "counterbalance": Effect("spring", _counterbalance),
     "windup": Effect("backlash", _windup),
-    "drift": Effect("drift", _drift),
-}
-#: What other masses can imitate.
-BALANCING = {"balancing": Effect("spring", _balancing)}
+    "drift": _of("drift", lambda t, q, v: 0.3 * np.sign(v) * (1 - t / t[-1])),
+}  # fmt: skip
+#: What other masses can imitate: 40 N m of the lift of a UR5 with its arm stretched out.
+BALANCING = {"balancing": Effect("spring", lambda t, q, *_: 40.0 * np.cos(q + 0.1))}
 
 
 def coloured(rng, shape, memory):

@@ -30,8 +30,7 @@ class FloatingMotion:
     def touching(self, t):
         """Return which contacts touch the ground, shape (N, k), bool: t (N,) [s]."""
         rows = np.searchsorted(self.t - self.t[0], t + 1e-9, side="right") - 1
-        flags = self.contacts[np.clip(rows, 0, len(self.t) - 1)]
-        return flags
+        return self.contacts[np.clip(rows, 0, len(self.t) - 1)]
 
     def evaluate(self, t):
         """Return q (N, 7 + n), v (N, 6 + n) and a (N, 6 + n), the twist with the axes of the base.
@@ -57,15 +56,7 @@ class FloatingMotion:
 def recorded(model, pi, motion, rng, *, rate, duration, acceleration=True, noise=0.01):
     """Return the log of a robot that follows a motion by the smallest forces of the ground.
 
-    Args:
-        model: The robot.
-        pi: Its parameters.
-        motion: Its motion.
-        rng: Source of the noise.
-        rate: Samples per second [Hz].
-        duration: Of the log [s].
-        acceleration: Whether accelerations are logged.
-        noise: Of the torques [N m].
+    Rate [Hz], duration [s], noise of the torques [N m]; accelerations are logged or not.
     """
     t, robot = np.arange(round(duration * rate) + 1) / rate, model.with_reference(pi)
     (q, v, a), flags = motion.evaluate(t), motion.touching(t)
