@@ -22,8 +22,8 @@ from robotid.dynamics.constraint_rows import (
     touching,
     without_forces,
 )
-from robotid.dynamics.prediction import predict
 from robotid.dynamics.prepared_logs import closed_log, with_contacts
+from robotid.dynamics.torque import predict
 from robotid.robot.constraints import Contact, link_positions
 from robotid.robot.model import RobotModel
 

@@ -15,8 +15,7 @@ from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import sentence_of
 from robotid.diagnosis.decisions import AGREES, DIFFERS, TINY
 from robotid.dynamics.constraint_rows import loop_basis, without_forces
-from robotid.dynamics.prediction import predict
-from robotid.dynamics.torque import joint_torque_regressor
+from robotid.dynamics.torque import joint_torque_regressor, predict
 from robotid.estimation.fitting.fitted import Fit
 from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.robot.parameters import pseudo_inertia
