@@ -15,8 +15,6 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from robotid.base.exceptions import DataError, ModelError, SettingsError
-from robotid.base.findings import listed
 from robotid.base.typing import Array
 
 #: As printed; errata 1 to 3 corrected, with separate p3 and p4; with columns 3 and 4 added.
@@ -64,11 +62,6 @@ class PlanarLinks:
     ybar2: float
     Izz2: float
 
-    def __post_init__(self) -> None:
-        if not all(0 < x < np.inf for x in (self.L1, self.L2, self.m1, self.m2, *self.central)):
-            inertias = f"inertias about the centres of mass {self.central}"
-            raise ModelError(f"lengths, masses and {inertias} of {self}: wanted positive numbers")
-
     @property
     def central(self) -> tuple[float, float]:
         """Inertia of each link about the vertical axis through its centre of mass [kg m^2]."""
@@ -83,7 +76,6 @@ PAPER_LINKS = PlanarLinks(1.0, 1.0, 10.0, -0.5, 0.0, 20.1, 1.9, 1.1 / 1.9, 0.1 /
 
 def parameters(links: PlanarLinks, *, form: Form = "corrected") -> Array:
     """Return the parameters P of an arm (27), shape (c,) [kg m^2]."""
-    _check_form(form)
     L1, L2, m1, m2 = links.L1, links.L2, links.m1, links.m2
     m1x, m2x, m2y = m1 * links.xbar1, m2 * links.xbar2, m2 * links.ybar2  # [kg m]
     p1 = links.Izz1 + 2 * L1 * m1x + L1**2 * m1 + L1**2 * m2
@@ -99,8 +91,7 @@ def regressor(q: Array, v: Array, a: Array, *, form: Form = "corrected") -> Arra
 
     q (..., 2) [rad], v (..., 2) [rad/s], a (..., 2) [rad/s^2].
     """
-    _check_form(form)
-    (_, q2), (v1, v2), (a1, a2) = _pair("q", q), _pair("v", v), _pair("a", a)
+    (_, q2), (v1, v2), (a1, a2) = (np.moveaxis(x, -1, 0) for x in (q, v, a))
     c2, s2, a12, v12 = np.cos(q2), np.sin(q2), 2 * a1 + a2, v2**2 + 2 * v1 * v2
     row1 = [a1, a1 + a2, c2 * a12 - 2 * s2 * v1 * v2, -s2 * v2**2, -s2 * a12 - c2 * v12]
     row2 = [0.0, a1 + a2, c2 * a1, s2 * v1**2, -s2 * a1 + c2 * v1**2]
@@ -116,7 +107,7 @@ def regressor(q: Array, v: Array, a: Array, *, form: Form = "corrected") -> Arra
 
 def printed_velocity_coefficient(q: Array, links: PlanarLinks) -> Array:
     """Return h of erratum 1, printed in (26) for both C122 and C211: q (..., 2) -> (...)."""
-    _, q2 = _pair("q", q)
+    q2 = q[..., 1]
     along, across = links.L2 * links.m2 + links.m2 * links.xbar2, links.m2 * links.ybar2  # [kg m]
     h: Array = links.L1 * (np.sin(q2) * along + np.cos(q2) * across)
     return h
@@ -137,15 +128,3 @@ def _body(i: int, parent: str, *numbers: float) -> str:
     # thin, but consistent: second moments 0.9 Izz along, 0.1 Izz across, 0.01 Izz normal to it
     Ixx, Iyy = 0.11 * Izz, 0.91 * Izz
     return _BODY.format(i=i, parent=parent, length=length, x=x, y=y, m=m, Ixx=Ixx, Iyy=Iyy, Izz=Izz)
-
-
-def _check_form(form: str) -> None:
-    if form not in PARAMETER_NAMES:
-        raise SettingsError(f"form is {form!r}, wanted one of {listed(PARAMETER_NAMES)}")
-
-
-def _pair(name: str, values: Array) -> tuple[Array, Array]:
-    array = np.asarray(values, dtype=float)
-    if array.shape[-1:] != (2,):
-        raise DataError(f"{name} has shape {array.shape}, wanted (2,)")
-    return array[..., 0], array[..., 1]

@@ -7,20 +7,18 @@ equations of Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robotid.base.exceptions import DataError, RankDeficientError, SettingsError
+from robotid.base.exceptions import RankDeficientError
 from robotid.base.typing import Array
 from robotid.dynamics.simulation.motions import ProgramMotion
 
 _DIVERGED = 1e3  # [rad or m; per s] deviation from the program beyond which a run is stopped
 
-#: Sign of the second term of (23): with minus it is a gradient, plus is printed in the paper.
-Sign: TypeAlias = Literal["corrected", "printed"]
 #: Accelerations of R robots, from their q, v and torques u, each of shape (R, n).
 Plant: TypeAlias = Callable[[Array, Array, Array], Array]
 
@@ -73,17 +71,13 @@ def reference_acceleration(
     return q_star
 
 
-def proximity(Psi: Array, P: Array, u: Array, *, sign: Sign = "corrected") -> Array:
-    """Return PRX = Psi^T Psi P - Psi^T u (23), or with a plus, as printed, shape (..., c).
+def proximity(Psi: Array, P: Array, u: Array) -> Array:
+    """Return PRX = Psi^T Psi P - Psi^T u (23), printed with a plus, shape (..., c).
 
-    With the minus it is the gradient (4) of the criterion (3), J = |u - Psi P|^2 / 2, and zero at
-    the true parameters. With the plus it is 2 Psi^T u there. Psi (..., n, c), P (..., c),
-    u (..., n) [N m or N].
+    It is the gradient (4) of the criterion (3), J = |u - Psi P|^2 / 2, and zero at the true
+    parameters. Psi (..., n, c), P (..., c), u (..., n) [N m or N].
     """
-    if sign not in ("corrected", "printed"):
-        raise SettingsError(f"sign is {sign!r}, wanted 'corrected' or 'printed'")
-    predicted = np.einsum("...nc,...c->...n", Psi, P)
-    residual = predicted - u if sign == "corrected" else predicted + u
+    residual = np.einsum("...nc,...c->...n", Psi, P) - u
     gradient: Array = np.einsum("...nc,...n->...c", Psi, residual)
     return gradient
 
@@ -151,30 +145,8 @@ class LoopSettings:
     updates: int = 100  # updates per run; the torque is constant between them (zero-order hold)
     # ``"recursive"``, (24) at each update, or ``"one_shot"``, (18) after each run
     method: Literal["recursive", "one_shot"] = "recursive"
-    sign: Sign = "corrected"  # sign in (23); with the printed one the procedure never stops
-    # acceleration of the regressor in (23): ``"measured"``, or ``"reference"``, q_* (15), as
-    # printed in (22). Then Psi P^ = u by (21): with the corrected sign PRX is zero for any
-    # estimate, so that the estimate never changes
-    prx_acceleration: Literal["measured", "reference"] = "measured"
     eps1: float = 1e-9  # if no entry of PRX is larger, it counts as zero [N m / s^2]
     eps2: float | Array = 1e-12  # if |Psi|^2 is not above it, there is no update [1/s^4]
-    bounds: tuple[Array, Array] | None = None  # the box Omega of (8): lowest, highest P, (c,) each
-
-    def __post_init__(self) -> None:
-        for name in ("alpha", "beta", "eps1", "eps2", "iterations", "updates"):
-            value = getattr(self, name)
-            if not np.all((np.asarray(value) > 0) & (np.asarray(value) < np.inf)):
-                raise SettingsError(f"{name} is {value}, wanted a positive number")
-        if self.method not in ("recursive", "one_shot"):
-            raise SettingsError(f"method is {self.method!r}, wanted 'recursive' or 'one_shot'")
-        if self.prx_acceleration not in ("measured", "reference"):
-            raise SettingsError(
-                f"prx_acceleration is {self.prx_acceleration!r}, wanted 'measured' or 'reference'"
-            )
-
-    def bounded(self, P: Array) -> Array:
-        """Return the nearest parameters within the bounds (8): P (R, c)."""
-        return P if self.bounds is None else np.clip(P, *self.bounds)
 
 
 @dataclass(frozen=True)
@@ -187,11 +159,7 @@ class Influences:
     q: float | Array = 0.0  # [rad or m]
     v: float | Array = 0.0  # [rad/s or m/s]
     a: float | Array = 0.0  # [rad/s^2 or m/s^2]
-    rng: np.random.Generator | None = None  # of the noise; required if there is any
-
-    def __post_init__(self) -> None:
-        if self.rng is None and any(np.any(np.asarray(x) != 0) for x in (self.q, self.v, self.a)):
-            raise SettingsError("sensor noise is stated, but rng is None, wanted a generator")
+    rng: np.random.Generator | None = None  # of the noise; None for sensors without noise
 
     def sensed(self, value: Array, level: float | Array) -> Array:
         """Return a measured value, with white noise of a standard deviation."""
@@ -215,9 +183,7 @@ class History:
     # constant; 0 if it did not
     diverged: NDArray[np.int_]
     skipped: NDArray[np.int_]  # (R,), updates omitted since D(q, P^) was not positive definite
-    torques: Array = field(
-        repr=False
-    )  # (L, updates, n), control u (21) of the first run [N m or N]
+    torques: Array  # (L, updates, n), control u (21) of the first run [N m or N]
 
     def relative_error(self, P: Array) -> Array:
         """Return |P^ - P| / |P| before the first iteration and after each: P (c,) -> (L + 1, R)."""
@@ -247,8 +213,6 @@ def run_procedure(
 
     Each iteration starts at rest at the start of the program, or at an offset from it, (n,).
     """
-    if P0.ndim != 2 or P0.shape[1] != len(dynamics.names):
-        raise DataError(f"P0 has shape {P0.shape}, wanted (R, {len(dynamics.names)})")
     chosen = settings or LoopSettings()
     loop = _Loop(dynamics, plant, motion, chosen, influences or Influences(), P0, offset)
     for number in range(1, chosen.iterations + 1):
@@ -280,7 +244,7 @@ class _Loop:
         self.alpha, self.beta = (np.reshape(x, (-1, 1)) for x in (settings.alpha, settings.beta))
         self.dt = np.broadcast_to(np.asarray(motion.duration) / settings.updates, (R,))  # [s]
         self.start = motion.evaluate(np.zeros(R))[0] + offset  # (R, n)
-        self.P = settings.bounded(P0)
+        self.P = P0
         self.active = np.ones(R, dtype=bool)
         self.NA, self.diverged, self.skipped = (np.zeros(R, dtype=int) for _ in range(3))
         #: Estimates, PRX, distances and torques, by iteration.
@@ -306,8 +270,7 @@ class _Loop:
             a = self.plant(q, v, applied)
             a_seen = influences.sensed(a, influences.a)
             G = self.dynamics.regressor(q_seen, v_seen, a_seen)  # (12)
-            moved = G if settings.prx_acceleration == "measured" else Psi
-            prx = np.abs(proximity(moved, self.P, u, sign=settings.sign)).max(axis=1)  # (23)
+            prx = np.abs(proximity(G, self.P, u)).max(axis=1)  # (23)
             largest = np.maximum(largest, prx)
             if settings.method == "recursive":
                 eta = a_seen - q_star  # (20), the deviation of the real from the program motion
@@ -326,26 +289,22 @@ class _Loop:
             values.append(value)
 
     def _update(self, q: Array, Psi: Array, eta: Array, is_open: NDArray[np.bool_]) -> None:
-        """Apply (24), then (8)."""
         sigma = smallest_eigenvalue(self.dynamics.mass_matrix(q, self.P))
         self.skipped = self.skipped + (self.active & (sigma <= 0.0))
         is_open = is_open & self.active
-        P = recursive_update(self.P, Psi, eta, sigma, is_open, eps2=self.settings.eps2)
-        self.P = self.settings.bounded(P)
+        self.P = recursive_update(self.P, Psi, eta, sigma, is_open, eps2=self.settings.eps2)
 
     def _update_once(self, samples: list[tuple[Array, Array]]) -> None:
-        """Apply (18) to the samples of one run, then (8)."""
         G, G_star = (np.stack(part, axis=1) for part in zip(*samples, strict=True))
         c, P = self.P.shape[1], self.P.copy()
         for r in np.flatnonzero(self.active):
             stacked = G[r].reshape(-1, c), G_star[r].reshape(-1, c)
             P[r] = one_shot(*stacked, self.P[r], self.dynamics.names)
-        self.P = self.settings.bounded(P)
+        self.P = P
 
     def _reset_diverged(
         self, number: int, q: Array, v: Array, program: tuple[Array, Array, Array]
     ) -> tuple[Array, Array]:
-        """Reset robots that have diverged to their program."""
         deviation = np.maximum(np.abs(q - program[0]), np.abs(v - program[1])).max(axis=1)
         diverges = ~(deviation < _DIVERGED)  # also with NaN
         self.diverged = np.where(diverges & self.active, number, self.diverged)

@@ -1,10 +1,8 @@
 """Run the paper's simulation and write its results, and a page of its figures and tables."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from html import escape
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -107,12 +105,13 @@ def run_paper(
     near = _random_motions(chosen, "off", 0.05, chosen.patience, report)
     exact = _random_motions(chosen, "on", 0.0, min(chosen.patience, chosen.iterations), report)
     drift = energy_drift()
-    arm, physical = _arm(), studies[list(MODELS).index("physical")]
+    physical = studies[list(MODELS).index("physical")]
     content = _content(chosen, studies, near, exact, drift)
-    content["inertial_vector"] = _inertial_vector(arm, physical)
     report("drawing", 0, 1, "pages")
     with folder_beside(target) as beside:
         (beside / "planar_2r.urdf").write_text(urdf_text(), encoding="utf-8")
+        arm = RobotModel.from_urdf(beside / "planar_2r.urdf")
+        content["inertial_vector"] = _inertial_vector(arm, physical)
         _write_replay(arm, physical, beside / "replay.html")
         html = paper_page(content, studies, drift)
         (beside / "paper.html").write_text(html, encoding="utf-8")
@@ -164,7 +163,7 @@ def _content(
         **{case: {s.name: _case(s, case) for s in studies} for case in CASES if case != "clean"},
         "trajectories": {name: runs.to_dict() for name, runs in near.items()},
         "trajectories_on_program": {name: runs.to_dict() for name, runs in exact.items()},
-        "errata": [asdict(e) for e in errata(np.random.default_rng(settings.seed))],
+        "errata": errata(np.random.default_rng(settings.seed)),
         "energy_drift": {
             "duration": float(t[-1]),
             "max_relative": {name: float(np.abs(E).max()) for name, E in gained.items()},
@@ -212,14 +211,6 @@ def _reason(case: str, errors: Array) -> str:
     )
 
 
-def _arm() -> RobotModel:
-    """Return the physical arm, read from its URDF."""
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "planar_2r.urdf"
-        path.write_text(urdf_text(), encoding="utf-8")
-        return RobotModel.from_urdf(path)
-
-
 def _inertial_vector(arm: RobotModel, study: ModelStudy) -> dict[str, Any]:
     """Return the arm's inertial parameters in the order of (9)-(10), true and identified.
 
@@ -240,7 +231,6 @@ def _inertial_vector(arm: RobotModel, study: ModelStudy) -> dict[str, Any]:
 
 
 def _write_replay(arm: RobotModel, study: ModelStudy, target: Path) -> None:
-    """Write the replay of the program motion (28), with the torques of the estimates."""
     t = np.linspace(0.0, DURATION, _SAMPLES)
     q, v, a = PROGRAM.evaluate(t)
     estimates = study.history.estimates[:, 0]
@@ -280,7 +270,7 @@ def paper_page(
         "disturbance": ("Disturbance and noise", disturbed),
         "trajectories": ("Random trajectories", _trajectories(content)),
         "errata": ("Errata", block("paper.errata") + listing("Errata", _ERRATA, content["errata"])),
-        "energy": ("Energy", _energy(content) + _energy_figure(*drift)),
+        "energy": ("Energy", _energy(*drift)),
         "settings": ("Settings", _settings(content)),
     }
     return page("The paper's simulation", _summary(content), sections)
@@ -293,13 +283,11 @@ def _summary(content: Mapping[str, Any]) -> str:
     gains = [others[name] / error for name, error in last.items()]
     reached = "".join(
         block(
-            "paper.reached",
-            name=escape(name),
-            error=number(error, ".2g").html,
+            "paper.reached", name=escape(name), error=number(error, ".2g").html,
             on_program=number(others[name], ".2g").html,
         )
         for name, error in last.items()
-    )
+    )  # fmt: skip
     beside = np.degrees(np.max(np.abs(content["settings"]["start_beside_program_rad"])))
     return block(
         "paper.summary",
@@ -360,12 +348,11 @@ def _disturbance(content: Mapping[str, Any]) -> str:
 
 
 def _trajectories(content: Mapping[str, Any]) -> str:
-    starts = {
-        "trajectories": "up to 0.05 rad off the program",
-        "trajectories_on_program": "on the program",
-    }
     rows = []
-    for key, start in starts.items():
+    for key, start in (
+        ("trajectories", "up to 0.05 rad off the program"),
+        ("trajectories_on_program", "on the program"),
+    ):
         for name, run in content[key].items():
             reached = run["iterations"] or [float("nan")]
             quantiles = {f"{p}": float(np.percentile(reached, p)) for p in (0, 50, 90, 100)}
@@ -374,11 +361,13 @@ def _trajectories(content: Mapping[str, Any]) -> str:
     return block("paper.trajectories") + table
 
 
-def _energy(content: Mapping[str, Any]) -> str:
-    drift = content["energy_drift"]
-    rows = [{"name": name, "change": 100 * x} for name, x in drift["max_relative"].items()]
+def _energy(t: Array, gained: Mapping[str, Array]) -> str:
+    changes = {name: 100 * share for name, share in gained.items()}
+    rows = [{"name": name, "change": np.abs(x).max()} for name, x in changes.items()]
     table = listing("Largest change of energy", _ENERGY, rows)
-    return block("paper.energy", duration=f"{drift['duration']:g}") + table
+    title, lines = "Energy gained in free motion", tuple(_lines(changes))
+    figure = _plots(Chart(title, t, lines, "time [s]", "energy gained [%]"))
+    return block("paper.energy", duration=f"{t[-1]:g}") + table + figure
 
 
 def _settings(content: Mapping[str, Any]) -> str:
@@ -391,7 +380,6 @@ def _settings(content: Mapping[str, Any]) -> str:
 
 
 def _written(value: object) -> str:
-    """Return the value of a setting as text; numbers of a list with commas."""
     if isinstance(value, list):
         return ", ".join(map(_written, value))
     return f"{value:.4g}" if isinstance(value, float) else str(value)
@@ -422,7 +410,6 @@ def _over_iterations(title: str, label: str, series: Sequence[Series], axis: str
 
 
 def _program_figures() -> str:
-    """Return the program motion (28) of both links."""
     t = np.linspace(0.0, DURATION, 201)
     names = ("position [rad]", "velocity [rad/s]", "acceleration [rad/s²]")
     charts = [
@@ -455,17 +442,15 @@ def _control_figures(studies: Sequence[ModelStudy]) -> str:
 
 
 def _estimate_figures(studies: Sequence[ModelStudy]) -> str:
-    """Return the estimated parameters (24) over the iterations, and the true ones."""
     charts = []
     for study in studies:
         names, P_hat = study.dynamics.names, study.history.estimates[:, 0]
         lines = _lines(dict(zip(names, P_hat.T, strict=True)))
-        true = {
-            f"{name}, true": np.full(len(P_hat), x) for name, x in zip(names, study.P, strict=True)
-        }
+        labels = [f"{name}, true" for name in names]
+        true = np.tile(study.P[:, None], len(P_hat))
+        lines += _lines(dict(zip(labels, true, strict=True)), is_weak=True)
         title = f"Figure 5. {study.name}: estimates (24)"
-        series = [*lines, *_lines(true, is_weak=True)]
-        charts.append(_over_iterations(title, "estimate [kg m²]", series))
+        charts.append(_over_iterations(title, "estimate [kg m²]", lines))
     return _plots(*charts)
 
 
@@ -483,7 +468,6 @@ def _convergence_figures(studies: Sequence[ModelStudy]) -> str:
 
 
 def _disturbed_figures(studies: Sequence[ModelStudy]) -> str:
-    """Return the parameter error under disturbance and noise."""
     return _plots(*(
         _over_iterations(
             f"{study.name}: parameter error with disturbed torque and noisy sensors",
@@ -493,10 +477,3 @@ def _disturbed_figures(studies: Sequence[ModelStudy]) -> str:
         )
         for study in studies
     ))  # fmt: skip
-
-
-def _energy_figure(t: Array, gained: Mapping[str, Array]) -> str:
-    """Return the energy gained by each model in free motion."""
-    lines = _lines({name: 100 * share for name, share in gained.items()})
-    title = "Energy gained in free motion"
-    return _plots(Chart(title, t, tuple(lines), "time [s]", "energy gained [%]"))

@@ -128,14 +128,13 @@ def study_model(
     """Run the paper's simulation (section VI) of one model, in every case."""
     dynamics, P = paper_arm(name)
     plant, cases = partial(dynamics.acceleration, P=P), list(CASES.values())
+    eps2 = np.array([case.eps2 for case in cases])
     history = run_procedure(
         dynamics,
         plant,
         PROGRAM,
         np.tile(P / 2, (len(cases), 1)),
-        settings=LoopSettings(
-            iterations=settings.iterations, eps2=np.array([case.eps2 for case in cases])
-        ),
+        settings=LoopSettings(iterations=settings.iterations, eps2=eps2),
         offset=np.array([case.offset for case in cases]),
         influences=_influences(cases, np.random.default_rng(settings.seed)),
         progress=progress,
@@ -252,20 +251,8 @@ _RANGE = (np.pi, 10.0, 20.0)  # [rad], [rad/s], [rad/s^2] of the random states
 _FREE = (np.array([[0.0, 1.0]]), np.array([[1.0, 2.0]]))  # [rad], [rad/s] start of free motion
 
 
-@dataclass(frozen=True)
-class Erratum:
-    """One error of the printed text."""
-
-    where: str  # the equation
-    printed: str  # the printed text
-    corrected: str  # the corrected text
-    # the largest over random states [N m]; for (23) that of the residual with the gradient PRX
-    max_torque_difference: float
-    max_torque_difference_on_program: float  # the largest along the program motion [N m]
-
-
-def errata(rng: np.random.Generator) -> list[Erratum]:
-    """Return the errata that change a torque, each with its largest torque difference.
+def errata(rng: np.random.Generator) -> list[dict[str, Any]]:
+    """Return the errata that change a torque, with its largest difference at random states.
 
     The last one is that of (22) in (23). Proof: u of (21) is C(q, v, P^) + D(q, P^) q_*, linear in
     P^, so u = Psi P^ with its gradient Psi (22), and PRX = Psi^T (Psi P^ - u) = 0 for every P^.
@@ -283,7 +270,10 @@ def errata(rng: np.random.Generator) -> list[Erratum]:
         ("(23), read as a torque residual at P̂ = P", "ΨᵀΨP̂ + Ψᵀu", "ΨᵀΨP̂ − Ψᵀu"),
         ("(23) with Ψ of (22), residual at P̂ = P / 2", "Ψ = G(q, q̇, q_*)", "Ψ = G(q, q̇, q̈)"),
     ]
-    return [Erratum(*text, *sizes) for text, *sizes in zip(texts, *largest, strict=True)]
+    keys = ("where", "printed", "corrected", "max_torque_difference",
+            "max_torque_difference_on_program")  # fmt: skip
+    rows = zip(texts, *largest, strict=True)
+    return [dict(zip(keys, (*text, *sizes), strict=True)) for text, *sizes in rows]
 
 
 def energy_drift(*, duration: float = 10.0, dt: float = 4e-3) -> tuple[Array, dict[str, Array]]:

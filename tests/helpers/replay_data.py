@@ -22,4 +22,4 @@ def unpacked(value):
 
 def leave_out_meshes(patch):
     """Leave out of pages what a robot looks like, which takes seconds to be thinned."""
-    patch.setattr("robotid.output.viewer.scene._thinned", lambda files, _: [[] for _ in files])
+    patch.setattr("robotid.output.viewer.replays._thinned", lambda files, _: [[] for _ in files])

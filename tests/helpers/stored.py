@@ -18,7 +18,7 @@ import lxml.html
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from helpers.pages import unpacked as numbers_of
+from helpers.pages import numbers_of
 from robotid.cli import main
 
 HERE = Path(__file__).resolve().parents[1] / "figures"
@@ -252,12 +252,13 @@ def _coordinates(svg):
 def unpacked(value):
     """Return the data of a chart with its packed numbers told by a few figures."""
     if isinstance(value, dict):
-        if {"data", "low", "high"} <= value.keys():
-            return summary(numbers_of(value), _OF_CHART) | (
-                {"is_log": True} if value["log"] else {}
-            )
         if {"data", "kind", "shape"} <= value.keys():
-            return told_columns(value)
+            if "step" not in value:
+                return told_columns(value)
+            if len(value["shape"]) > 1:
+                return {"low": value["low"], "step": value["step"], "codes": told_columns(value)}
+            is_log = {"is_log": True} if "log" in value else {}
+            return summary(numbers_of(value), _OF_CHART) | is_log
         usual = {"faint": False, "hidden": False, "half": None, "marks": [], "logarithmic": "",
                  "x_names": [], "spans": []}  # fmt: skip
         if value.get("x_label") == "computing time [s]":

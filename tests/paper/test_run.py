@@ -8,13 +8,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.pages import number, tables
+from helpers.pages import chart, charts, number, tables
 
 from robotid.paper import run as paper
-from robotid.paper import study
 from robotid.paper.procedure import LoopSettings
 from robotid.paper.run import run_paper
-from robotid.paper.study import CASES, MODELS, PaperSettings, energy_drift
+from robotid.paper.study import CASES, MODELS, PaperSettings, energy_drift, study_model
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import INERTIAL_TERMS
 
@@ -26,8 +25,8 @@ def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("paper") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper, "energy_drift", lambda: energy_drift(duration=1.0))
-        for module in (paper, study):
-            patch.setattr(module, "LoopSettings", partial(LoopSettings, updates=20))
+        for module in ("run", "study"):
+            patch.setattr(f"robotid.paper.{module}.LoopSettings", partial(LoopSettings, updates=20))
         return folder, run_paper(folder, settings=FEW)
 
 
@@ -85,9 +84,6 @@ def test_the_page_is_whole_and_offline(written):
     assert len(ids) == len(set(ids))
     for said in ("Figure 3(a)", "Figure 4(b)", "Figure 5", "Errata", "NA (25)", "C122 = −h"):
         assert said in html
-
-
-# --- the page ---------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -169,3 +165,69 @@ def test_a_case_is_judged_at_its_end_by_a_tenth_and_by_the_mean_of_the_later_hal
     assert not any(found["converged"] for found in (*said.values(), paper._model(study)))
     assert said["on_program"]["reason"].startswith("slow: every run follows the same curve")
     assert said["noisy"]["reason"].startswith("A disturbance v is part of the deviation")
+
+
+@pytest.fixture(scope="module")
+def studies():
+    return [study_model(name, PaperSettings(iterations=3, longest=1)) for name in MODELS]
+
+
+def close(drawn, wanted):
+    """Assert that a series is the data, to what 16 bits tell apart."""
+    np.testing.assert_allclose(drawn, wanted, atol=2e-5 * max(np.ptp(wanted), 1e-9))
+
+
+def test_figure_4_is_the_control_of_its_joint_by_iterations(studies):
+    html = paper._control_figures(studies)
+    for study in studies:
+        for joint in (0, 1):
+            u = study.history.torques[:, :, joint]
+            title = f"Figure 4({'ab'[joint]}). {study.name}: control u{joint + 1} (21)"
+            upper, lower = [what for what in charts(html) if what["title"].startswith(title)]
+            close(upper["x"], 0.02 * np.arange(100))
+            assert [s["label"] for s in upper["series"][:2]] == ["iteration 1", "iteration 2"]
+            for k in (0, 1):
+                close(upper["series"][k]["y"], u[k])
+                close(lower["series"][k]["y"], u[k] - u[-1])
+            _, program = study.program_control(101)
+            close(upper["series"][-1]["y"], program[:-1, joint])
+
+
+def test_figure_3_is_the_program_motion_of_its_joint():
+    drawn = charts(paper._program_figures())
+    t = np.linspace(0.0, 1.0, 201)  # over the duration of 2 s
+    shape = 10 * t**3 - 15 * t**4 + 6 * t**5  # (28)
+    rate, curvature = (30 * t**2 * (1 - t) ** 2 / 2, 60 * t * (1 - t) * (1 - 2 * t) / 4)
+    parts = [amplitude * x for amplitude in (1.0, 1.5) for x in (shape, rate, curvature)]
+    for what, wanted in zip(drawn, parts, strict=True):
+        close(what["x"], 2.0 * t)
+        close(what["series"][0]["y"], wanted)
+
+
+def test_figure_5_is_each_parameter_beside_its_true_value(studies):
+    html = paper._estimate_figures(studies)
+    for study in studies:
+        series = chart(html, f"Figure 5. {study.name}")["series"]
+        count = len(study.dynamics.names)
+        for i, name in enumerate(study.dynamics.names):
+            assert [series[i]["label"], series[count + i]["label"]] == [name, f"{name}, true"]
+            close(series[i]["y"], study.history.estimates[:, 0, i])
+            close(series[count + i]["y"], np.full(4, study.P[i]))
+
+
+def test_errors_are_those_of_their_model_and_case(studies):
+    html = paper._convergence_figures(studies)
+    prx, errors = (chart(html, title)["series"] for title in ("Largest entry", "Parameter error"))
+    for k, study in enumerate(studies):
+        known = np.isfinite(prx[k]["y"])
+        assert not known[0]  # before the first iteration there is none
+        np.testing.assert_allclose(prx[k]["y"][known], study.history.prx[:, 0], rtol=1e-3)
+        np.testing.assert_allclose(errors[k]["y"], study.errors(), rtol=1e-3)
+        np.testing.assert_allclose(errors[3 + k]["y"], study.errors("on_program"), rtol=1e-3)
+    html = paper._disturbed_figures(studies)
+    for study in studies:
+        series = chart(html, study.name)["series"]
+        for line, case in zip(
+            series, ("clean", "disturbed", "noisy", "noisy_dead_zone"), strict=True
+        ):
+            np.testing.assert_allclose(line["y"], study.errors(case), rtol=1e-3)

@@ -5,7 +5,7 @@ import trimesh
 from helpers.hostile_urdfs import FILES
 
 from robotid.diagnosis.urdf.inspection import inspect_urdf
-from robotid.output.viewer.scene import robot_scene
+from robotid.output.viewer.replays import robot_scene
 from robotid.robot.examples import example_urdfs
 from robotid.robot.geometry import (
     body_boxes,

@@ -361,20 +361,13 @@ def check_order(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[Fin
     every = max(1, len(q) // _MOST)
     dx, dp = (np.gradient(y, motion.t, axis=0)[::every] for y in (x, p))
     feet = _Feet(motion.t, every, x[::every], dx, dp if log.base.has_position else None)
-    yield from _check_readings(log, feet, q, np.asarray(model.pin_model.gravity.linear))
-
-
-def _check_readings(log: Log, feet: _Feet, q: Array, gravity: Array) -> Iterator[Finding]:
-    """Yield the finding of ``check_order`` for feet and the logged quaternion (N, 4)."""
-    size = float(np.linalg.norm(gravity))
-    up = -gravity / size if size else np.zeros(3)
-    stated = feet.turned(q)
+    gravity = np.asarray(model.pin_model.gravity.linear)
+    up, stated = -gravity / (float(np.linalg.norm(gravity)) or 1.0), feet.turned(q)
     mean, speed = feet.upwards(stated[0]), feet.speed(stated)
     height, is_moving = float(mean @ up), speed >= _MOVES
     slower: list[tuple[float, float, str, str]] = []  # rank, speed, reading, gravity
-    for key, quaternion in (
-        orientation_readings(q).items() if is_moving or height <= -_ABOVE else ()
-    ):
+    tried = orientation_readings(q) if is_moving or height <= -_ABOVE else {}
+    for key, quaternion in tried.items():
         pose = feet.turned(quaternion)
         moves, direction = feet.speed(pose), feet.upwards(pose[0])
         is_above, is_slow = direction @ up >= _ABOVE, is_moving and moves < _SLOWER * speed

@@ -21,14 +21,10 @@ from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import AGREES, BEYOND_NOISE, DIFFERS, SHARE_OF_ROWS
 from robotid.robot.parameters import ParameterLayout
 
-#: [rad/s, or m/s of a prismatic joint] slower: at rest.
-AT_REST = 0.02
-#: [rad or m] smaller range: the joint does not move.
-STATIC = 1e-3
-#: Share of the log in which a joint must move.
-MOVING = 0.1
-#: Share of its largest value, below which a torque that is never negative is 0.
-ZERO = 0.05
+AT_REST = 0.02  # [rad/s, or m/s of a prismatic joint] slower: at rest
+STATIC = 1e-3  # [rad or m] smaller range: the joint does not move
+MOVING = 0.1  # Share of the log in which a joint must move
+ZERO = 0.05  # Share of its largest value, below which a torque that is never negative is 0
 #: Largest range of a locked joint, and largest difference from its stated position [rad or m].
 STILL = 0.02
 _LEAST = {"q": 1e-3, "dq": 0.02}  # [rad or m, rad/s or m/s] smaller values: at rest

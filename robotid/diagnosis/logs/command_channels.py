@@ -54,12 +54,12 @@ def check_commands(log: Log, prismatic: Collection[str] = ()) -> Iterator[Findin
     yield from _shown(log, moved)
     yield from _held(log, moved)
     yield from _alike(log, moved)
-    early = []
-    for loop in moved:  # a joint that moves before its command
-        lag, error = loop.lag
-        if lag < -max(SIGNIFICANT * error, loop.step):
-            words = {"lag": lag, "lead": -lag, "std_error": error}
-            early.append(finding("delayed_command", log.name, loop.name, **words))
+    early = [  # a joint that moves before its command
+        finding("delayed_command", log.name, loop.name, lag=lag, lead=-lag, std_error=error)
+        for loop in moved
+        for lag, error in [loop.lag]
+        if lag < -max(SIGNIFICANT * error, loop.step)
+    ]
     clipped = dict(_saturated(log, moved))
     small = list(_small(log, [loop for loop in moved if loop.name not in clipped]))
     yield from (*early, *clipped.values(), *small)
@@ -108,8 +108,7 @@ class _Loop:
     @property
     def command(self) -> Array:
         """Commanded positions, shape (N,)."""
-        assert self.log.q_ref is not None
-        return np.asarray(self.log.q_ref[self.rows, self.joint])
+        return np.asarray(self.log.q_ref)[self.rows, self.joint]
 
     @property
     def is_commanded(self) -> bool:
@@ -357,9 +356,8 @@ def _disturbed(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
         since = round(_SETTLED / loop.step)
         changed = np.append(True, np.diff(loop.command) != 0)
         last = np.maximum.accumulate(np.where(changed, np.arange(len(changed)), 0))
-        runs = [run for run in runs_of(np.arange(len(last)) - last >= since)]
-        rows = np.concatenate([np.arange(i, k) for i, k in runs] or [np.empty(0, int)])
-        if len(rows) * loop.step < _CONSTANT:
+        runs = runs_of(np.arange(len(last)) - last >= since)
+        if sum(k - i for i, k in runs) * loop.step < _CONSTANT:
             continue
         centred = np.concatenate([q[i:k] - q[i:k].mean(axis=0) for i, k in runs])
         moved, others = centred[:, loop.joint], np.delete(centred, loop.joint, axis=1)

@@ -1,17 +1,13 @@
 """Selection of the terms of each joint's drive: the fewest that explain held-out segments.
 
-Terms are added to viscous and Coulomb friction, joint by joint, on samples spread over the fitted
-logs. The family that explains most of the held-out segments is selected if it is significant, then
-the next one together with it, until no family improves the fit. Validation logs are not used.
+Terms are added to viscous and Coulomb friction, joint by joint: the family that explains most is
+selected if it is significant, then the next one together with it. Validation logs are not used.
 Where the prior binds the bodies, those of least squares replace them: a wrong prior does not become
-friction, and a term that inertia explains as well has no gain.
+friction.
 
-The nonlinear parameters of a family, its shape, are searched on a grid. Then all shapes of a joint
-are refined together, with the linear parameters refitted in each step (variable projection, Golub,
-Pereyra 2003).
-
-Where constraint forces were eliminated, the torque of a drive appears in the rows of other joints,
-too. The families of each joint are then selected again together with those of the others.
+The nonlinear parameters of a family, its shape, are searched on a grid, then those of a joint are
+refined together (variable projection, Golub, Pereyra 2003). Where constraint forces were
+eliminated, the families of each joint are selected again together with those of the others.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

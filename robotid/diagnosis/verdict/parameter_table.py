@@ -12,8 +12,7 @@ from robotid.base.typing import Array
 from robotid.diagnosis.decisions import CORRELATED, connected
 from robotid.estimation.fitting.fitted import Fit, Identified
 
-#: Columns of a row: link or drive, parameter, the URDF's value, the identified one, its standard
-#: error, its 95 % interval, what determined it, unit.
+#: Columns of a row; low and high are the ends of the 95 % interval, source what determined it.
 HEADERS = ("part", "parameter", "urdf", "value", "std_error", "low", "high", "source", "unit")
 _NUMBERS = HEADERS[2:7]
 #: Mass [kg], centre of mass [m], inertia about it [kg m^2], in the axes of the joint frame.

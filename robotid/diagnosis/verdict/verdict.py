@@ -18,27 +18,21 @@ from robotid.diagnosis.catalogue import codes_with, reason_of, sentence_of
 from robotid.diagnosis.verdict.scale_check import ScaleCheck
 from robotid.estimation.fitting.evaluation import JointMetrics, Metrics, logs_that_test
 
-#: [%] largest torque prediction error on validation logs of a joint that is "good".
-GOOD = 15.0
-#: [%] a joint with a larger torque prediction error is not usable.
-POOR = 50.0
-#: [%] the same limits of simulated position errors.
-GOOD_POSITION, POOR_POSITION = 5.0, 30.0
+GOOD = 15.0  # [%] largest torque prediction error on validation logs of a joint that is "good"
+POOR = 50.0  # [%] a joint with a larger torque prediction error is not usable
+GOOD_POSITION, POOR_POSITION = 5.0, 30.0  # [%] the same limits of simulated position errors
 #: Error over that of the second-order model from which it is hardly smaller: half the squares.
 HARDLY = 0.7
-#: A simpler model is better if its error is smaller by this factor ...
-BEATEN = 1.05
+BEATEN = 1.05  # A simpler model is better if its error is smaller by this factor ...
 _TIE = 0.3  # [%] ... and, for the URDF with fitted drives, by this share of the torque
-#: [%] a larger error on the fitted logs, twice that of WLS, makes a joint poor.
-COSTLY = 3.0
+COSTLY = 3.0  # [%] a larger error on the fitted logs, twice that of WLS, makes a joint poor
 #: [%] of the torque: a smaller prediction error rejects a hypothesis on columns or masses, and
 #: gives no warning of a missing drive term.
 SMALL = 5.0
 _HARMLESS = 1.0  # [%] of the torque, below which an error gives no warning
 _MUCH = 2.0  # ratio of two errors, or of two gravity torques, that is no chance
 _BASE = "base."  # of the rows of a floating base
-#: Parameters, joints or places that a sentence names.
-NAMED = 8
+NAMED = 8  # Parameters, joints or places that a sentence names
 _NOT_VERIFIED = "not verified, no validation log"
 _UNSCALED = "torque scale not verified"
 _HYPOTHESES = ("current_for_torque", "gravity", "gravity_compensated", "unexplained_torque",
@@ -162,9 +156,7 @@ class Determined:
     is_consistent: bool = True  # whether the parameters are physically consistent
     is_poorly_excited: bool = True  # whether a richer motion would determine them; else noise
     is_static: bool = False
-    #: Other drive parameters whose standard error is not smaller than 0.9 of their prior standard
-    #: deviation.
-    uncertain_drives: Sequence[str] = ()
+    uncertain_drives: Sequence[str] = ()  # standard error from 0.9 of the prior's deviation
 
     def warnings(self) -> list[str]:
         """Return the reasons why the result is at best usable."""

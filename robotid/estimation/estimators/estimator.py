@@ -77,9 +77,7 @@ class Estimate:
 class Estimator(ABC, Generic[DataT]):
     """Interface of estimators: settings are constructor arguments, data arguments of ``fit``."""
 
-    #: Form of the data: triangular factors of all rows, the samples one by one, or a simulator that
-    #: is compared with the data.
-    reads: ClassVar[Literal["factors", "samples", "simulator"]]
+    reads: ClassVar[Literal["factors", "samples", "simulator"]]  # form of the data
 
     @property
     def weighing(self) -> Weighing:

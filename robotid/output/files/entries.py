@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -36,17 +36,14 @@ def build_result(
     found: Identification, settings: Mapping[str, Any], outputs: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
     """Return the content of result.json: plain values, all numbers finite."""
+    require_kind(found, Identification, "identification", "a robotid.Identification")
     model, (bodies, drives) = found.model, parameter_entries(found)
     if isinstance(found, TorqueIdentification):
         own = _torque_entries(found, settings)
         beside = found.urdf_with_drives[len(bodies) :].tolist()
         drives = [x | {"with_urdf": value} for x, value in zip(drives, beside, strict=True)]
     else:
-        from robotid.identification.closed_loop.from_commands import PositionIdentification
-
-        require_kind(found, PositionIdentification, "identification", "a robotid.Identification")
-        assert isinstance(found, PositionIdentification)
-        own = loop_entries(found)
+        own = loop_entries(cast("PositionIdentification", found))
     common = {
         "schema_version": SCHEMA_VERSION,
         "robotid": __version__,
@@ -77,7 +74,7 @@ def build_result(
 
 
 def _torque_entries(found: TorqueIdentification, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of result.json that only an identification from torques has."""
+    names = found.model.layout.names
     return {
         "structure": _determined(found),
         "uncertainty": {
@@ -85,9 +82,7 @@ def _torque_entries(found: TorqueIdentification, settings: Mapping[str, Any]) ->
             "segments": found.errors.segments,
             "inflation": found.errors.inflation,
         },
-        "covariance": covariance_entry(
-            found.model.layout.names, found.standard_covariance, found.at_bound
-        ),
+        "covariance": covariance_entry(names, found.standard_covariance, found.at_bound),
         "motors": _motors(found, settings),
         "friction": {drive.joint: _friction(found, drive) for drive in found.drives},
         "consistency": {
@@ -122,9 +117,8 @@ def _variation(found: TorqueIdentification) -> dict[str, Any]:
     rows = zip(found.model.row_names, next_errors(found).tolist(), strict=True)
     content = found.variation.to_dict() | {"next_torque_rmse": dict(rows)}
     noise = found.regressor_noise
-    sums = found.sums.to_dict() | {
-        "unit": [found.variation.unit_names[k] for k in found.variation.of_runs]
-    }
+    units = [found.variation.unit_names[k] for k in found.variation.of_runs]
+    sums = found.sums.to_dict() | {"unit": units}
     if noise is not None and noise.is_corrected:
         sums["shift"] = noise.shift.tolist()
     return {"variation": content | {"sums": sums}}
@@ -171,7 +165,6 @@ def build_preview(preview: "Preview") -> dict[str, Any]:
 
 
 def _friction(found: TorqueIdentification, drive: DriveChoice) -> dict[str, Any]:
-    """Return the friction terms of a joint, and the terms that were tried."""
     own = [term for term in found.model.layout.terms if TERMS[term].is_friction]
     choice, row = drive.to_dict(), found.model.row_names.index(drive.joint)
     runs = [e.recording for e in found.fitted]
@@ -186,7 +179,6 @@ def _friction(found: TorqueIdentification, drive: DriveChoice) -> dict[str, Any]
 
 
 def _structure(found: Identified) -> dict[str, Any]:
-    """Return the numbers of parameters, and the undetermined ones."""
     return {
         "standard": found.model.layout.n_inertial,
         "base_inertial": len(structural_mapping(found.model, inertial_only=True).K),
@@ -274,7 +266,6 @@ def _motors(
 
 
 def _consistency(found: Identified) -> dict[str, Any]:
-    """Return whether the bodies are physically consistent, and their masses."""
     layout = found.model.layout
     J = pseudo_inertia(found.standard[: layout.n_inertial])
     smallest = np.linalg.eigvalsh(J)[:, 0]
@@ -288,11 +279,9 @@ def _consistency(found: Identified) -> dict[str, Any]:
     }
 
 
-def _band(identification: TorqueIdentification, evaluation: Evaluation) -> dict[str, Any]:
-    recording, band = evaluation.recording, identification.band(evaluation)
-    covered = band.coverage(
-        recording.trajectory.tau, evaluation.torques["estimate"], recording.mask
-    )
+def _band(found: TorqueIdentification, evaluation: Evaluation) -> dict[str, Any]:
+    run, band = evaluation.recording, found.band(evaluation)
+    covered = band.coverage(run.trajectory.tau, evaluation.torques["estimate"], run.mask)
     return {
         row: {
             "half_width": float(QUANTILE * np.sqrt(np.mean(total**2))),
@@ -300,7 +289,7 @@ def _band(identification: TorqueIdentification, evaluation: Evaluation) -> dict[
             "coverage_pct": finite(100 * share),
         }
         for row, total, parameters, share in zip(
-            identification.model.row_names, band.total.T, band.parameters.T, covered, strict=True
+            found.model.row_names, band.total.T, band.parameters.T, covered, strict=True
         )
     }
 
@@ -309,9 +298,8 @@ def loop_entries(found: "PositionIdentification") -> dict[str, Any]:
     """Return the entries of result.json that only an identification by simulation has."""
     model, estimate = found.model, found.estimate
     bodies = zip(found.mapping.base_names, found.mapping.independent, found.base_error, strict=True)
-    unfitted = [
-        name for name, i, error in bodies if i < model.layout.n_inertial and math.isinf(error)
-    ]
+    first = model.layout.n_inertial  # of drives
+    unfitted = [name for name, i, error in bodies if i < first and math.isinf(error)]
     return {
         "structure": {
             "rank": estimate.rank,

@@ -14,8 +14,17 @@ from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
 from robotid.base.settings import require_kind
 from robotid.base.typing import Array
-from robotid.output.files.exports import Exported, Format, Option, Written
-from robotid.output.files.links import WORLD, SimulatedLink, XmlFormat, own_drives, write_model
+from robotid.output.files.exports import (
+    WORLD,
+    Exported,
+    Format,
+    Option,
+    SimulatedLink,
+    Written,
+    XmlFormat,
+    own_drives,
+    write_model,
+)
 from robotid.output.files.result_file import CommandedDrive, Result, limit_of
 from robotid.output.files.urdf import numbers_text
 from robotid.robot.bodies import principal_moments
@@ -210,9 +219,8 @@ def _add_motion(
     if link.inertial is not None:
         moments, axes = principal_moments(link.inertial)
         x, y, z = np.maximum(moments, 0.0)  # their sums are possible moments in any rounding
-        pose = np.append(
-            link.inertial[1:4] / link.inertial[0], Rotation.from_matrix(axes).as_quat()
-        )
+        com = link.inertial[1:4] / link.inertial[0]
+        pose = np.append(com, Rotation.from_matrix(axes).as_quat())
         mass, inertia = numbers_text(link.inertial[:1]), numbers_text([y + z, z + x, x + y])
         ET.SubElement(body, "inertial", _pose(pose) | {"mass": mass, "diaginertia": inertia})
     if link.floats:
@@ -253,9 +261,8 @@ def _add_drives(
     values: Mapping[str, float],
     servos: _Servos,
 ) -> None:
-    tendons, equality, actuators = (
-        ET.SubElement(top, tag) for tag in ("tendon", "equality", "actuator")
-    )
+    tags = ("tendon", "equality", "actuator")
+    tendons, equality, actuators = (ET.SubElement(top, tag) for tag in tags)
     for coupling in model.layout.couplings:
         at = {"name": coupling.name} | _drive(coupling.name, values)
         tendon = ET.SubElement(tendons, "fixed", at)

@@ -358,15 +358,13 @@ def _drives(model: RobotModel, names: list[str], values: Array) -> dict[str, dic
 
 
 def _projected(result: Result, values: Array) -> dict[str, dict[str, Any]]:
-    """Return viscous and Coulomb friction and offset in place of all friction of a drive."""
     model, pi = result.identified
     drives = project_friction(model, pi, result.drive_moments, SIMULATED).drives
     return {
         drive.name: {
             term: (np.maximum(x, 0.0) if term != "offset" else x).tolist()
-            for term, x in zip(
-                drive.values, drive.transfer @ values[:, list(drive.own)].T, strict=True
-            )
+            for term, T in zip(drive.values, drive.transfer, strict=True)
+            for x in [values[:, list(drive.own)] @ T]
         }
         for drive in drives
     }

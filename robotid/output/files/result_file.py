@@ -237,9 +237,8 @@ class Result:
                 f"{self.path.name} has no friction curve of {joint!r}; joints with a curve: "
                 f"{listed(curves)}{suggestion(joint, curves)}"
             )
-        curve = curves[joint]
-        v, torque, std = (np.array(curve[key]) for key in ("v", "torque", "std_error"))
-        return FrictionCurve(v, torque, std, curve["load"])
+        v, torque, std = (np.array(curves[joint][key]) for key in ("v", "torque", "std_error"))
+        return FrictionCurve(v, torque, std, curves[joint]["load"])
 
     def table(self) -> Any:  # noqa: ANN401
         """Return the parameters as a table; see ``Identification.table``."""
@@ -290,7 +289,6 @@ def load_result(path: str | Path) -> Result:
 
 
 def _with_moved_inputs(result: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Return the content of a result with the present paths of its inputs."""
     payloads = result.get("scale_check", {}).get("payloads", [])
     known = [(x["path"], x["sha256"]) for x in result["inputs"]]
     known += [(x["log"], x["sha256"]) for x in payloads]
@@ -370,21 +368,13 @@ def stated_scale_check(result: Mapping[str, Any]) -> ScaleCheck | None:
     stated = result.get("scale_check")
     if stated is None:
         return None
-    lists = {"unexplained": (stated["unexplained"], 2), "masses": (stated["masses"], 3)}
-    lists |= {"common": (stated["common"], 2)} if "common" in stated else {}
-    payloads = stated.get("payloads", [])
-    for k, check in enumerate(payloads):
-        lists[f"payloads[{k}].interval"] = check["interval"], 2
-    for name, (numbers, size) in lists.items():
-        if len(numbers) != size:
-            raise DataError(f"scale_check.{name} has {len(numbers)} numbers, wanted {size}")
-    own = {x.name: stated[x.name] for x in dataclasses.fields(ScaleCheck) if x.name in stated}
-    own |= {"common": tuple(stated["common"])} if "common" in stated else {}
-    own["payloads"] = tuple(map(PayloadCheck.from_dict, payloads))
+    facts = {x.name: stated[x.name] for x in dataclasses.fields(ScaleCheck) if x.name in stated}
+    facts |= {"common": tuple(stated["common"])} if "common" in stated else {}
+    facts["payloads"] = tuple(map(PayloadCheck.from_dict, stated.get("payloads", [])))
     if stated["is_stated"]:  # an earlier version did not test whether torque determines it
         mass = stated.get("stated")
-        own["stated"] = StatedMass(()) if mass is None else StatedMass.from_dict(mass)
-    return ScaleCheck(**own)
+        facts["stated"] = StatedMass(()) if mass is None else StatedMass.from_dict(mass)
+    return ScaleCheck(**facts)
 
 
 def stated_urdf_with_drives(result: Mapping[str, Any], model: RobotModel) -> Array | None:
@@ -392,14 +382,8 @@ def stated_urdf_with_drives(result: Mapping[str, Any], model: RobotModel) -> Arr
     drives = [entry.get("with_urdf") for entry in result["drive_parameters"]]
     if None in drives:
         return None
-    pi = model.standard_parameters()
-    if len(drives) != len(pi) - model.layout.n_inertial:
-        wanted = len(pi) - model.layout.n_inertial
-        raise DataError(
-            f"drive_parameters has {len(drives)} entries, wanted the {wanted} of the robot"
-        )
-    pi[model.layout.n_inertial :] = drives
-    return pi
+    require_lengths(drives, [len(model.layout.drive_names)], "drive_parameters")
+    return np.append(model.standard_parameters()[: model.layout.n_inertial], drives)
 
 
 def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:
@@ -420,16 +404,12 @@ def stated_covariance(result: Mapping[str, Any], names: Sequence[str]) -> Array 
     """Return the covariance of parameters of a result; None if an earlier version wrote it."""
     if "covariance" not in result:
         return None
-    stated, rows = result["covariance"]["names"], result["covariance"]["root"]
-    if len(stated) != len(rows):
-        raise DataError(
-            f"covariance of the result has {len(rows)} rows, wanted {len(stated)}, one for each "
-            "name; write the result again"
-        )
-    own = dict(zip(stated, rows, strict=True))
-    root = np.zeros((len(names), max(map(len, own.values()), default=0)))
+    stated = result["covariance"]
+    require_lengths(stated["root"], [len(stated["names"])], "covariance.root")
+    rows = dict(zip(stated["names"], stated["root"], strict=True))
+    root = np.zeros((len(names), max(map(len, rows.values()), default=0)))
     for row, name in zip(root, names, strict=True):
-        row[: len(own.get(name, ()))] = own.get(name, ())
+        row[: len(rows.get(name, ()))] = rows.get(name, ())
     return root @ root.T
 
 

@@ -8,8 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.output.files.exports import Exported, Format, Written
-from robotid.output.files.links import WORLD, SimulatedLink, XmlFormat, write_model
+from robotid.output.files.exports import (
+    WORLD,
+    Exported,
+    Format,
+    SimulatedLink,
+    Written,
+    XmlFormat,
+    write_model,
+)
 from robotid.output.files.result_file import Result
 from robotid.output.files.urdf import numbers_text
 from robotid.robot.bodies import central_inertial

@@ -64,7 +64,15 @@ def write_urdf(
     written = link_parameters(model, pi)
     _check_target(source, goal)
     original, places = source.read_bytes(), link_places(model)
-    content = _content(original, model, pi, written, dynamics=dynamics)
+    document = xml_splice.parse(original, source.name)
+    stated = model.tree.inertials
+    changed = {link: x for link, x in written.items() if not _is_as_stated(x, stated.get(link))}
+    edits = _inertial_edits(document, changed, places) + _angle_edits(document, model)
+    if isinstance(dynamics, Projection):
+        edits += _dynamics_edits(document, dynamics.model, dynamics.pi)
+    elif dynamics:
+        edits += _dynamics_edits(document, model, pi)
+    content = xml_splice.apply(document, edits)
     sidecar = goal.with_name(f"{goal.stem}.drive.json")
     of_source = source.with_name(f"{source.stem}.drive.json")
     check_folder(goal.parent, [goal.name, sidecar.name], [source, of_source])
@@ -139,34 +147,11 @@ def terms_from_facts(tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[
     return {name: [term_from_dict(term) for term in terms] for name, terms in tables.items()}
 
 
-def _content(
-    original: bytes,
-    model: RobotModel,
-    pi: Array,
-    written: Mapping[str, Array],
-    *,
-    dynamics: Projection | bool,
-) -> bytes:
-    document = xml_splice.parse(original, Path(model.tree.path).name)
-    changed = {
-        link: pi
-        for link, pi in written.items()
-        if not _is_as_stated(pi, model.tree.inertials.get(link))
-    }
-    edits = _inertial_edits(document, changed, link_places(model)) + _angle_edits(document, model)
-    if isinstance(dynamics, Projection):
-        edits += _dynamics_edits(document, dynamics.model, dynamics.pi)
-    elif dynamics:
-        edits += _dynamics_edits(document, model, pi)
-    return xml_splice.apply(document, edits)
-
-
 def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
 def _facts(model: RobotModel, pi: Array, places: Sequence[LinkPlace]) -> dict[str, Any]:
-    """Return the content of a sidecar: options of the model, and parameters of the drives."""
     layout, first = model.layout, model.layout.n_inertial
     units = dict(zip(layout.names[first:], layout.units[first:], strict=True))
     values: dict[str, dict[str, float]] = {drive.name: {} for drive in layout.drives}
@@ -231,32 +216,28 @@ def link_parameters(model: RobotModel, pi: Array) -> dict[str, Array]:
     layout = model.layout
     advice = "identify with the estimator 'consistent', whose bodies and drives are possible"
     held = held_parameters(model)
-    whole, urdf = pi[: layout.n_inertial], model.standard_parameters()[: layout.n_inertial]
-    own = whole - held
-    for k, link in enumerate(layout.bodies):
-        smallest, of_whole, of_urdf = (
-            float(np.linalg.eigvalsh(pseudo_inertia(x[10 * k : 10 * k + 10])[0])[0])
-            for x in (own, whole, urdf - held)
-        )
-        if not smallest > 0:
-            others = f", without links beyond {listed(model.locked)}," if model.locked else ""
-            todo = advice
-            if not of_urdf > 0:
-                todo = "the URDF's own is impossible, too: correct it (robotid inspect)"
-            elif of_whole > 0:  # what is taken off makes it impossible
-                todo = (
-                    f"links beyond locked joints keep the URDF's inertials, {held[10 * k]:.3g} kg "
-                    f"of {whole[10 * k]:.3g} kg; correct these, or identify the locked joints, too"
-                )
-            raise ModelError(
-                f"link {link!r}{others} would be physically impossible: the smallest eigenvalue of "
-                f"its pseudo-inertia is {smallest:.3g}, wanted > 0; {todo}"
+    bodies, urdf = pi[: layout.n_inertial], model.standard_parameters()[: layout.n_inertial]
+    moving = bodies - held
+    least = [np.linalg.eigvalsh(pseudo_inertia(x))[:, 0] for x in (moving, bodies, urdf - held)]
+    for k in np.flatnonzero(~(least[0] > 0))[:1]:
+        others = f", without links beyond {listed(model.locked)}," if model.locked else ""
+        todo = advice
+        if not least[2][k] > 0:
+            todo = "the URDF's own is impossible, too: correct it (robotid inspect)"
+        elif least[1][k] > 0:  # what is taken off makes it impossible
+            todo = (
+                f"links beyond locked joints keep the URDF's inertials, {held[10 * k]:.3g} kg "
+                f"of {bodies[10 * k]:.3g} kg; correct these, or identify the locked joints, too"
             )
+        raise ModelError(
+            f"link {layout.bodies[k]!r}{others} would be physically impossible: the smallest "
+            f"eigenvalue of its pseudo-inertia is {least[0][k]:.3g}, wanted > 0; {todo}"
+        )
     for i in np.flatnonzero(layout.is_nonnegative() & (pi < 0)):
         raise ModelError(
             f"{layout.names[i]} is {pi[i]:.3g} {layout.units[i]}, wanted 0 or more; {advice}"
         )
-    return dict(zip(layout.bodies, own.reshape(-1, 10), strict=True))
+    return dict(zip(layout.bodies, moving.reshape(-1, 10), strict=True))
 
 
 def _inertial_edits(
@@ -289,7 +270,6 @@ def _angle_edits(document: Document, model: RobotModel) -> list[Edit]:
 
 
 def _is_as_stated(parameters: Array, stated: Inertial | None) -> bool:
-    """Return whether a link's parameters, shape (10,), equal those of its ``<inertial>``."""
     if stated is None:
         return False
     before = inertial_parameters(stated)
@@ -302,9 +282,7 @@ def _inertial(parameters: Array) -> list[str]:
     com = np.where(np.abs(body.com) > ROUNDING * size, body.com, 0.0)
     least = ROUNDING * body.mass * size**2
     inertia = np.where(np.abs(body.inertia) > least, body.inertia, 0.0)
-    moments = " ".join(
-        f'{key}="{numbers_text([value])}"' for key, value in zip(MOMENTS, inertia, strict=True)
-    )
+    moments = _attributes(zip(MOMENTS, inertia.tolist(), strict=True))
     return [
         "<inertial>",
         f'<origin xyz="{numbers_text(com)}" rpy="0 0 0"/>',
@@ -329,13 +307,18 @@ def _dynamics_edits(document: Document, model: RobotModel, pi: Array) -> list[Ed
         if name not in model.joints or name in shared:
             continue
         names = {f"{name}.{term}": attribute for term, attribute in attributes.items()}
-        new = {names[key]: numbers_text([values[key]]) for key in names if key in values}
+        new = {names[key]: values[key] for key in names if key in values}
         if new and found:
-            edits += xml_splice.set_attributes(document, found[0], new)
+            texts = {key: numbers_text([value]) for key, value in new.items()}
+            edits += xml_splice.set_attributes(document, found[0], texts)
         elif new:
-            words = " ".join(f'{key}="{value}"' for key, value in new.items())
-            edits.append(xml_splice.insert(document, joint, [f"<dynamics {words}/>"]))
+            line = f"<dynamics {_attributes(new.items())}/>"
+            edits.append(xml_splice.insert(document, joint, [line]))
     return edits
+
+
+def _attributes(values: Iterable[tuple[str, float]]) -> str:
+    return " ".join(f'{key}="{numbers_text([value])}"' for key, value in values)
 
 
 def _check_torque(model: RobotModel, pi: Array, urdf: Path, sidecar: Path) -> None:

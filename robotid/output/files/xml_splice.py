@@ -15,6 +15,7 @@ from robotid.base.exceptions import ModelError
 # the tag at the start of an element; the value of an attribute may contain ">"
 _TAG = re.compile(rb"<[^\s/>]+(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")
 _ATTRIBUTE = re.compile(rb"\s([^\s=/>]+)\s*=\s*(\"[^\"]*\"|'[^']*')")
+_ENCODING = re.compile(rb"(?:\xef\xbb\xbf)?<\?xml[^>]*?\sencoding\s*=\s*[\"']([\w.:-]+)")
 _BOMS = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
 
 
@@ -161,9 +162,7 @@ def _codec(data: bytes, where: str) -> str:
     for bom, codec in _BOMS.items():
         if data.startswith(bom):
             return codec
-    declared = re.compile(rb"(?:\xef\xbb\xbf)?<\?xml[^>]*?\sencoding\s*=\s*[\"']([\w.:-]+)").match(
-        data
-    )
+    declared = _ENCODING.match(data)
     try:
         return codecs.lookup(declared[1].decode() if declared else "utf-8").name
     except LookupError as error:

@@ -111,9 +111,7 @@ def with_error(value: float, error: float, *, sign: str = "") -> tuple[Cell, Cel
     """Cells for a number and its error, the error with two digits, both to the same place."""
     if not (math.isfinite(error) and error > 0 and math.isfinite(value)):
         return number(value, f"{sign}.4g"), number(None)
-    exponent = math.floor(
-        math.log10(float(f"{error:.1e}"))
-    )  # of the first digit of the rounded error
+    exponent = int(f"{error:.1e}".partition("e")[2])  # of the first digit of the rounded error
     size = math.floor(math.log10(abs(value))) if value else exponent
     if max(size, exponent) < -3 or exponent > 4:
         digits = max(size - exponent + 1, 0)
@@ -423,7 +421,6 @@ def _sorted(values: Array | None, order: NDArray[np.int_]) -> Any:  # noqa: ANN4
 
 
 def _union(lines: Sequence[Array], points: int, count: int) -> NDArray[np.int_]:
-    """Return points that are sufficient for every line."""
     if count <= points:
         return np.arange(count)
     share = max(points // len(lines), 8)

@@ -99,7 +99,6 @@ def _short_names(paths: Sequence[str | Path]) -> dict[str, str]:
 
 
 def _shortest(names: tuple[str, ...], every: set[tuple[str, ...]]) -> str:
-    """Return the shortest end that only one path has."""
     ends = [names[-size:] for size in range(1, len(names) + 1)]
     unique = [end for end in ends if sum(other[-len(end) :] == end for other in every) == 1]
     return str(Path(*(unique or [names])[0]))
@@ -108,7 +107,6 @@ def _shortest(names: tuple[str, ...], every: set[tuple[str, ...]]) -> str:
 def _require_same_mapping(
     first: str, one: Mapping[str, Any], second: str, other: Mapping[str, Any]
 ) -> None:
-    """Refuse results whose base parameters have other expressions."""
     ours, theirs = (
         {
             entry["name"]: entry["expression"]
@@ -346,9 +344,8 @@ def _error_table(
         if are_alike and len(known) > 1:
             least = percent(min(error for error in errors if error is not None)).html
             cells = [_bold(x) if x.html == least and known.count(least) == 1 else x for x in cells]
-        entries.append(
-            {**row, **_cells(content, "error", cells), **_cells(content, "rmse", row["rmse"])}
-        )
+        rmse = _cells(content, "rmse", row["rmse"])
+        entries.append({**row, **_cells(content, "error", cells), **rmse})
     return listing(caption, columns, entries)
 
 
@@ -441,7 +438,6 @@ def fleet_page(content: Mapping[str, Any]) -> str:
 
 
 def _failures(content: Mapping[str, Any]) -> str:
-    """Return the failures, the first of each kind first."""
     failures = content["failures"]
     kinds = [_kind(failure) for failure in failures]
     count, first = Counter(kinds), {kind: k for k, kind in reversed([*enumerate(kinds)])}
@@ -467,7 +463,6 @@ def _more(count: int, file: str) -> str:
 
 
 def _with_errors(entry: Mapping[str, Any], value: str, ends: str) -> dict[str, Any]:
-    """Return an entry with its value and ends to the digits of its standard error."""
     error = entry["std_error"]
     digits, std_error = with_error(entry[value], error)
     low, high = (with_error(x, error)[0] for x in entry[ends])

@@ -186,13 +186,11 @@ def _picture(
         mark = quantity.marks[key]
         others += f'<svg x="{_at(value)}" overflow="visible" aria-hidden="true">{mark.svg}</svg>'
         words.append(f"{mark.words} {percent(value).html} %")
-    lines = "".join(
-        f'<line x1="{_at(limit)}" x2="{_at(limit)}" y1="-2" y2="18"/>' for limit in quantity.limits
-    )
-    title = f"{joint}: error {percent(error).html} %; for comparison {', '.join(words)}"
-    return block(
-        "report.picture", row=row, title=escape(title), lines=lines, width=_at(error), others=others
-    )
+    places = map(_at, quantity.limits)
+    lines = "".join(f'<line x1="{x}" x2="{x}" y1="-2" y2="18"/>' for x in places)
+    title = escape(f"{joint}: error {percent(error).html} %; for comparison {', '.join(words)}")
+    figures = {"lines": lines, "width": _at(error), "others": others}
+    return block("report.picture", row=row, title=title, **figures)
 
 
 def _legend(quantity: Quantity, known: set[str]) -> str:

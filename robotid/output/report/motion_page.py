@@ -57,9 +57,8 @@ def write_motion_page(
         "time": Section("Course over time", _over_time(model, content, course)),
         "expected": Section("Expected standard errors", _expected(expected)),
     }
-    return write_text(
-        page(f"{model.name}: excitation trajectory", _head(model, content), sections), target
-    )
+    title = f"{model.name}: excitation trajectory"
+    return write_text(page(title, _head(model, content), sections), target)
 
 
 def _head(model: RobotModel, content: Mapping[str, Any]) -> str:
@@ -83,7 +82,6 @@ def _head(model: RobotModel, content: Mapping[str, Any]) -> str:
 
 
 def _limit_table(model: RobotModel, content: Mapping[str, Any], course: Course) -> str:
-    """Return the largest used share of each limit, its joint and time, and the margin."""
     rows = []
     for k, kind in enumerate(LIMITS):
         if entry := content["limits"].get(kind):
@@ -119,10 +117,9 @@ def _collisions(content: Mapping[str, Any], course: Course) -> str:
 
 
 def _nearest(where: str, distance: float, time: float, required: float, between: str = "") -> str:
-    millimetres = {"distance": f"{1e3 * distance:.0f}", "required": f"{1e3 * required:.0f}"}
-    return block(
-        "motion.collisions", where=escape(where), time=f"{time:.2f}", between=between, **millimetres
-    )
+    figures = {"distance": f"{1e3 * distance:.0f}", "required": f"{1e3 * required:.0f}"}  # [mm]
+    figures |= {"where": escape(where), "time": f"{time:.2f}", "between": between}
+    return block("motion.collisions", **figures)
 
 
 def _over_time(model: RobotModel, content: Mapping[str, Any], course: Course) -> str:
@@ -155,9 +152,8 @@ def _expected(preview: Preview) -> str:
     found, noise = preview.expected, preview.noise
     ratio = np.minimum(preview.base_error / preview.plausible, 1.0)
     order = np.argsort(-ratio, kind="stable")[:_NAMED]
-    least = [
-        f"{found.mapping.base_names[k]} {100 * ratio[k]:.0f} %" for k in order if ratio[k] > _OPEN
-    ]
+    names = found.mapping.base_names
+    least = [f"{names[k]} {100 * ratio[k]:.0f} %" for k in order if ratio[k] > _OPEN]
     stds = [f"{joint} {s:.2g}" for joint, s in zip(found.model.joints, noise.std, strict=True)]
     sentences = [
         f"{preview.words}.",

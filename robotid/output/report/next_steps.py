@@ -215,7 +215,6 @@ def _of_verdict(found: TorqueIdentification) -> list[Cause]:
 
 
 def _names_cause(cause: Cause) -> bool:
-    """Whether a cause names why the error of its joints is large."""
     names_cause = catalogue_entries().get(cause.code, {}).get("names_cause", False)
     return names_cause or step_of(cause.code) in ("terms", "as_found")
 
@@ -335,7 +334,6 @@ def _zeros(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause])
 
 
 def _as_found(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    """Return the messages of the findings, which name a cause and its remedy."""
     return Step(" ".join(f"{sentence_of(m)}." for cause in causes for m in cause.messages[:1]))
 
 

@@ -113,21 +113,18 @@ def torque_charts(
     name, unit = found.model.row_names[row], found.model.row_units[row]
     band = found.band(evaluation) if band is None else band
     half = QUANTILE * np.interp(np.arange(len(motion.t)), band.samples, band.total[:, row])
-    model, urdf = (
-        np.where(used, evaluation.torques[key][:, row], np.nan) for key in ("estimate", "urdf")
-    )
-    t, tau, model, urdf, half = broken(
-        motion.segment, motion.t, motion.tau[:, row], model, urdf, half
-    )
+    torques = [evaluation.torques[key][:, row] for key in ("estimate", "urdf")]
+    lines = motion.tau[:, row], *(np.where(used, x, np.nan) for x in torques), half
+    t, tau, model, urdf, half = broken(motion.segment, motion.t, *lines)
     spans = unused_spans(t, np.isfinite(model))
     kind = "force" if unit == "N" else "torque"
     title = f"{kind.capitalize()} of {name} over time: measured, identified, URDF"
-    lines = (
+    above = (
         Series("URDF", urdf, "urdf", is_weak=True, is_hidden=_dwarfs(urdf, tau, model)),
         Series("measured", tau, "text", is_weak=True),
         Series("identified, 95 % band", model, "predicted", half=half),
     )
-    torque = Chart(title, t, lines, "time [s]", f"{kind} [{unit}]", link, spans)
+    torque = Chart(title, t, above, "time [s]", f"{kind} [{unit}]", link, spans)
     title = f"Residual of {name} over time, measured minus identified"
     zero = np.where(np.isfinite(model), 0.0, np.nan)
     below = (

@@ -147,9 +147,7 @@ def sources_fact(entries: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     """Return the number of parameters by source, HTML by its name."""
     counts = {kind: sum(entry["source"] == kind for entry in entries) for kind in SOURCE_NAMES}
     known = {kind: count for kind, count in counts.items() if count}
-    shares = "".join(
-        f'<i class="from-{kind}" style="flex: {count}"></i>' for kind, count in known.items()
-    )
+    shares = "".join(f'<i class="from-{k}" style="flex: {n}"></i>' for k, n in known.items())
     words = ", ".join(f"{count} {SOURCE_NAMES[kind]}" for kind, count in known.items())
     name = f"{len(entries)} parameters, determined by"
     return {name: f'<span class="shares">{shares}</span>{words}'}
@@ -160,10 +158,8 @@ def body_table(identification: TorqueIdentification) -> str:
     central = central_parameters(identification)
     rows = []
     for i, body in enumerate(identification.model.layout.bodies):
-        cells = []
-        for value, half, urdf in zip(
-            central.values[i], central.half[i], central.urdf[i], strict=True
-        ):
+        cells, parts = [], (central.values[i], central.half[i], central.urdf[i])
+        for value, half, urdf in zip(*parts, strict=True):
             identified = both(value, half)
             prior = with_error(urdf, half)[0].html
             html = f'{identified.html}<br><span class="note">{prior}</span>'
@@ -195,9 +191,8 @@ def consistency_section(identification: TorqueIdentification) -> str:
     """Return whether bodies and drives are consistent, and the constraints of the fit."""
     details, layout = identification.estimate.details, identification.model.layout
     lows = np.linalg.eigvalsh(pseudo_inertia(identification.standard[: layout.n_inertial]))[:, 0]
-    wrong = [
-        f"{body} ({low:.3g})" for body, low in zip(layout.bodies, lows, strict=True) if low <= 0
-    ]
+    bodies = zip(layout.bodies, lows, strict=True)
+    wrong = [f"{body} ({low:.3g})" for body, low in bodies if low <= 0]
     notes = [f"Inconsistent, with the smallest eigenvalue: {listed(wrong)}."] if wrong else []
     for key, words in _CONSTRAINTS.items():
         if key in details:

@@ -2,16 +2,20 @@
 
 import hashlib
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.figures import figures
 
+import robotid
 from robotid.base.exceptions import DataError, ModelError
 from robotid.base.findings import Finding
-from robotid.output.files.entries import build_result
+from robotid.output.files.entries import _covariance, build_result, loop_entries, loop_parameters
 from robotid.output.files.result_file import read_result, stated_parameters
 from robotid.robot.parameters import INERTIAL_TERMS
 
@@ -211,3 +215,103 @@ def test_results_that_are_not_whole_are_refused(result, identified, tmp_path):
     short = {**result, "drive_parameters": result["drive_parameters"][1:]}
     with pytest.raises(ModelError, match=r"^the result has no value of shoulder_pan_joint\.arm"):
         stated_parameters(short, identified.model)
+
+
+@pytest.fixture(scope="module")
+def loaded_from(identified, tmp_path_factory):
+    """The folder of a result, and the identification that wrote it."""
+    folder = tmp_path_factory.mktemp("result") / "out"
+    robotid.save_result(identified, folder)
+    return folder, identified
+
+
+def test_a_result_has_the_robot_its_parameters_verdict_and_metrics(loaded_from):
+    folder, found = loaded_from
+    for path in (folder, folder / "result.json"):
+        result = robotid.load_result(path)
+        assert result.robot.joints == found.model.joints
+        np.testing.assert_allclose(result.parameters, found.standard, rtol=1e-9, atol=1e-12)
+        assert result.verdict == found.verdict.to_dict()
+    fitted, kept = result.metrics.values()
+    for joint, measured in found.metrics().per_joint.items():
+        assert fitted[joint]["rmse"] == pytest.approx(measured.rmse, rel=1e-12)
+    for joint, measured in found.validation[0].metrics["estimate"].per_joint.items():
+        assert kept[joint]["relative_error_pct"] == pytest.approx(measured.relative_error_pct)
+    assert list(result.metrics)[1].endswith("kept.csv")
+    assert repr(result) == (
+        f"<Result of {found.model.name}: {len(found.base)} base parameters by consistent, verdict "
+        f"{found.verdict.status}>"
+    )
+
+
+def test_it_predicts_inverse_dynamics_and_friction_at_instants(loaded_from):
+    folder, found = loaded_from
+    result, n = robotid.load_result(folder), len(found.model.joints)
+    q, v, a = np.random.default_rng(1).uniform(-2, 2, (3, 5, n))
+    robot = found.model.with_parameters(found.standard).pin_model
+    data = robot.createData()
+    values = dict(zip(found.model.layout.names, found.standard, strict=True))
+    Ia, Fv, Fc, offset = (
+        np.array([values[f"{joint}.{term}"] for joint in found.model.joints])
+        for term in ("armature", "viscous", "coulomb", "offset")
+    )
+
+    def torque(q, v, a):
+        rigid = np.array([pin.rnea(robot, data, *state) for state in zip(q, v, a, strict=True)])
+        return rigid + Ia * a + Fv * v + Fc * np.sign(v) + offset
+
+    wanted = torque(q, v, a)
+    np.testing.assert_allclose(result.predict(q, v, a), wanted, rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(result.predict(q[1], v[1], a[1]), wanted[1], rtol=1e-8, atol=1e-9)
+    still = np.zeros_like(v)
+    np.testing.assert_allclose(result.predict(q, v), torque(q, v, still), rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(result.predict(q), torque(q, still, still), rtol=1e-8, atol=1e-9)
+
+
+def test_a_result_without_a_urdf_says_why_there_is_no_robot(loaded_from, tmp_path):
+    path = shutil.copy(loaded_from[0] / "result.json", tmp_path)
+    result = robotid.load_result(path)
+    del result.content["outputs"]["urdf"]
+    assert result.verdict["status"]
+    with pytest.raises(DataError, match=r"result.json has no URDF, because its parameters are"):
+        _ = result.robot
+
+
+def test_each_joint_has_its_gains_with_units_and_sources(crane):
+    shown = {entry["name"]: entry for entry in loop_parameters(crane)}
+    units = {"rail": ("N/m", "N s/m", "m"), "turn": ("N m/rad", "N m s/rad", "rad")}
+    loops, unknowns = crane.fit.loops, crane.fit.simulator.free_parameters
+    free = {(x.what, crane.model.joints[j]): k for k, x in enumerate(unknowns) for j in x.joints}
+    for j, (joint, (of_kp, of_kd, of_zero)) in enumerate(units.items()):
+        for what, unit in (("kp", of_kp), ("kd", of_kd), ("delay", "s"), ("zero", of_zero)):
+            entry, k = shown[f"{joint}.{what}"], free.get((what, joint))
+            assert (entry["value"], entry["unit"]) == (getattr(loops, what)[j], unit)
+            assert (entry["source"] == "stated") == (k is None)
+            error = None if k is None else crane.fit.estimate.std_error[k]
+            assert entry["std_error"] == error
+
+
+def test_bodies_that_no_log_determines_are_named_as_undetermined(crane):
+    undetermined = loop_entries(crane)["ranges"]["undetermined"]  # boom.Izz is fitted
+    assert undetermined == ["boom.mcx", "boom.mcy", *crane.undetermined]
+
+
+def test_the_covariance_is_that_of_the_free_parameters_that_are_not_at_a_bound(rng):
+    """Free: a gain, the delay of both joints, an armature and a zero, which is at its bound."""
+    slopes, A = rng.standard_normal((3, 4)), rng.standard_normal((4, 4))
+    free = [("kp", (0,)), ("delay", (0, 1)), ("armature", (1,)), ("zero", (1,))]
+    names = ["a.kp", "delay", "b.armature", "b.zero"]
+    estimate = SimpleNamespace(
+        theta=np.zeros(4), covariance=A @ A.T, details={"at_bound": ("b.zero",)}
+    )
+    simulator = SimpleNamespace(
+        names=names, standard=lambda model, theta: (None, slopes),
+        free_parameters=[SimpleNamespace(what=what, joints=joints) for what, joints in free],
+    )  # fmt: skip
+    model = SimpleNamespace(layout=SimpleNamespace(names=("x", "y", "z")), joints=("a", "b"))
+    fit = SimpleNamespace(simulator=simulator)
+    entry = _covariance(SimpleNamespace(fit=fit, estimate=estimate, model=model))
+    assert entry["names"] == ["x", "y", "z", "a.kp", "a.delay", "b.delay", "b.zero"]
+    S = np.vstack([slopes, np.eye(4)[[0, 1, 1, 3]]])[:, :3]
+    L = np.array([[*row, *[0.0] * (7 - len(row))] for row in entry["root"]])
+    np.testing.assert_allclose(L @ L.T, S @ (A @ A.T)[:3, :3] @ S.T, atol=1e-6)

@@ -1,9 +1,6 @@
 """Blocks that several pages share: the verdict, figures beside their names, commands to copy."""
 
-from decimal import Decimal
-
 import numpy as np
-import pytest
 
 from robotid.output.pages.html import (
     Section,
@@ -51,22 +48,6 @@ def test_a_small_error_of_a_plain_number_is_written_in_full():
         (-1.5e6, 9.94e4, ("−1500000", "99400")), (-1.5e6, 1.2e5, ("−1.50e+06", "1.2e+05")),
     ):  # fmt: skip
         assert tuple(cell.html for cell in with_error(value, error)) == wanted
-
-
-def test_a_number_ends_at_the_second_digit_of_its_error(rng):
-    sizes = zip(rng.uniform(-6, 6, 300), rng.uniform(-7, 5, 300), strict=True)
-    for value, error in ((rng.choice([-1, 1]) * 10.0**a, 10.0**b) for a, b in sizes):
-        cells = with_error(value, error)
-        shown, half = (Decimal(cell.html.replace("−", "-")) for cell in cells)
-        assert [cell.value for cell in cells] == [value, error]
-        ends, digits = half.as_tuple().exponent, len(half.as_tuple().digits)
-        if error < 99.5:
-            assert digits == 2 or half == 0
-        assert float(half) == pytest.approx(error, rel=0.051)
-        assert shown.as_tuple().exponent == ends or abs(value) < error
-        assert abs(float(shown) - value) <= 0.5001 * 10.0 ** shown.as_tuple().exponent
-    assert [cell.html for cell in with_error(1.234, np.inf)] == ["1.234", "–"]
-    assert with_error(0.5, 0.25, sign="+")[0].html == "+0.50"
 
 
 def test_a_cell_has_the_style_of_its_content_and_its_number_in_full():

@@ -39,19 +39,6 @@ def warning(code, where="elbow_joint", severity="warning", **evidence):
     return Finding(code, severity, where, f"{code} is so; do something", evidence, joints=joints)
 
 
-def predicted(identified, path, errors):
-    """Return the validation recording with another file and other errors of the joints [%]."""
-    (kept,) = identified.validation
-    metrics = kept.metrics["estimate"]
-    per_joint = {
-        joint: replace(m, relative_error_pct=x, baselines={k: 99.0 for k in m.baselines})
-        for (joint, m), x in zip(metrics.per_joint.items(), errors, strict=True)
-    }
-    recording = replace(kept.recording, log=replace(kept.recording.log, path=path))
-    changed = {**kept.metrics, "estimate": replace(metrics, per_joint=per_joint)}
-    return replace(kept, recording=recording, metrics=changed)
-
-
 def words(steps):
     return [step.words.split()[0] for step in steps]
 
@@ -260,9 +247,6 @@ def test_nothing_is_typed_where_nothing_is_known_of_commands(identified):
 def test_a_block_of_several_steps_is_in_the_last_of_them_only():
     steps = [Step("a", ("x", "y")), Step("b", ("z",)), Step("c", ("x", "w")), Step("d", ("w",))]
     assert [step.blocks for step in _once(steps)] == [("y",), ("z",), ("x",), ("w",)]
-
-
-# --- identifications that predict positions -------------------------------------------------------
 
 
 def judged(crane, status, findings=(), log_errors=()):

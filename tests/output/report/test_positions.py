@@ -11,8 +11,7 @@ from helpers.pages import bars, charts, tables
 
 from robotid.base.findings import Finding
 from robotid.output.report.next_steps import Origin
-from robotid.output.report.report_content import write_report
-from robotid.output.report.report_page import Residual, worst_second
+from robotid.output.report.report_content import Residual, worst_second, write_report
 
 JOINTS = ("rail", "turn")
 
