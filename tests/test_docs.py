@@ -141,7 +141,7 @@ def test_the_page_on_simulation_says_what_the_settings_say_and_runs(tmp_path, mo
 
 
 def test_the_first_tutorial_runs_as_written(tmp_path):
-    """In an empty folder, as a user, but for a shorter search; numbers may differ from the page's."""
+    """In an empty folder, as a user, but with a shorter search; numbers may differ."""
     programs, folder = tmp_path / "bin", tmp_path / "empty"
     for name, words in (("robotid", "-m robotid"), ("python", "")):
         programs.mkdir(exist_ok=True)
