@@ -69,4 +69,4 @@ def run(options: argparse.Namespace) -> None:
     error = identification.base - truth
     within = sum(abs(error) < 3 * identification.base_error)
     echo(f"\n{within} of {len(truth)} base parameters lie within 3 standard errors of the truth")
-    print_files(options.out, [*result["outputs"].values(), "result.json"])
+    print_files([*result["outputs"].values(), "result.json"], options.out)

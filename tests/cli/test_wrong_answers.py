@@ -59,6 +59,7 @@ class Workplace:
             "urdf": str(URDF),
             "identification": [{"log": str(log)}],
             "validation": [{"log": str(path)} for path in kept],
+            "model": {"friction": "viscous+coulomb"},
             "output": {"report": False},
             **settings,
         }

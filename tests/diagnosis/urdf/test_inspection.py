@@ -297,6 +297,9 @@ def test_only_findings_that_take_assumed_masses_as_evidence_are_explained(tmp_pa
     assert explained_by_assumed(none, scale)
     assert not explained_by_assumed(none, spikes)
     assert not explained_by_assumed(clean, scale)
+    upper, lower = none.standard_parameters()[:20].reshape(2, 10)  # boxes of 1000 kg/m^3
+    np.testing.assert_allclose(lower, [1, 0, 0, 0, *0.02 / 12 * np.array([1, 0, 1, 0, 0, 1])])
+    np.testing.assert_allclose(upper[[0, 1, 6]], [6, 1.5, 6 * (0.37 / 12 + 0.25**2)])
 
 
 # --- inertials against the geometry ---------------------------------------------------------------
