@@ -15,7 +15,6 @@ from robotid.base.exceptions import DataError
 from robotid.base.findings import listed
 from robotid.base.typing import Array, real_numbers
 from robotid.data.log import Trajectory
-from robotid.dynamics.compiled import work_per_sample
 from robotid.dynamics.constraint_rows import without_forces
 from robotid.dynamics.rows import (
     BLOCK,
@@ -27,6 +26,7 @@ from robotid.dynamics.rows import (
     remembered,
     trajectory_rows,
     trajectory_values,
+    work_per_sample,
 )
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.drive_term import DriveMotion

@@ -13,7 +13,7 @@ from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.dynamics.constraint_rows import ProjectedRows, loop_basis, mixed_rows, without_forces
-from robotid.dynamics.problem import Block, Problem, RowSource
+from robotid.dynamics.factors import Block, Problem, RowSource
 from robotid.dynamics.rows import (
     BLOCK,
     BLOCK_SIZE,
