@@ -4,15 +4,18 @@ import re
 from functools import cache, partial
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers import driven as helper
 from helpers.driven import ELBOW, JOINTS, LIFT, arm, driven, driven_log
 
+import robotid
 from robotid.base.exceptions import SettingsError
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.estimation.fitting.fitted import friction_curve
 from robotid.robot.drive_term import DriveMotion
 from robotid.robot.drives import AUTO, FAMILIES, Harmonic, LoadFriction, Stribeck, Tanh
+from robotid.robot.examples import example_urdf
 
 found_in, fitted_in = (partial(f, estimator="wls") for f in (helper.found_in, helper.fitted_in))
 SEED, QUANTILE = 3, 1.5  # of the motion: the elbow turns more than half a turn
@@ -123,6 +126,8 @@ def test_the_family_is_chosen_on_its_joint_and_nothing_on_others(chosen_in, name
     plain_error, error = (x.held_out_error_pct for x in taken)
     assert error < 0.7 * plain_error
     assert taken[1].p_value < 0.015
+    beside = [x.held_out_error_pct for x in choice.tried if len(x.families) == 2]
+    assert max(beside, default=0.0) < 0.7 * plain_error  # with the weights of the family, too
     # noise is 1 % of the torque; shapes of the grid leave more than those of the fit
     assert error == pytest.approx(1.0, abs=0.5)
     assert found.metrics().per_joint[ELBOW].relative_error_pct == pytest.approx(1.0, rel=0.15)
@@ -230,3 +235,31 @@ def test_what_is_nearly_chosen_widens_the_intervals_it_would_move(plain):
         assert found.standard_error[k] > alone.standard_error[k]
         assert abs(found.standard[k] - coulomb) < SURE * found.standard_error[k]
     assert seen
+
+
+# --- wrong bodies of a URDF -----------------------------------------------------------------------
+
+
+RATE, SECONDS, NOISE = 100.0, 24.0, 0.01  # [Hz], [s], of the standard deviation of each torque
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_bodies_of_1_g_in_the_urdf_do_not_become_springs(tmp_path, seed):
+    source = example_urdf("ur10_robot.urdf")
+    light = '<inertia ixx="1e-6" iyy="1e-6" izz="1e-6" ixy="0" ixz="0" iyz="0"'
+    text = re.sub(r'<mass value="[^"]*"', '<mass value="1e-3"', source.read_text())
+    (tmp_path / "light.urdf").write_text(re.sub(r"<inertia [^>/]*", light, text))
+    plant = pin.buildModelFromUrdf(str(source))
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(RATE * SECONDS)) / RATE
+    w = 2 * np.pi / SECONDS * np.arange(1, 9)
+    a, b = rng.uniform(-0.35, 0.35, (2, len(w), plant.nv))
+    S, C = np.sin(np.outer(t, w)), np.cos(np.outer(t, w))
+    q, v, acc = S @ a + C @ b, (C * w) @ a - (S * w) @ b, -(S * w**2) @ a - (C * w**2) @ b
+    data = plant.createData()
+    tau = np.array([pin.rnea(plant, data, *row) for row in zip(q, v, acc, strict=True)])
+    size = np.std(tau, axis=0)
+    tau += size * (0.1 * v + 0.1 * np.sign(v) + NOISE * rng.standard_normal(tau.shape))
+    log = robotid.Log(t=t, q=q, tau=tau, joints=tuple(plant.names)[1:])
+    found = robotid.identify(tmp_path / "light.urdf", log)
+    assert {c.joint: c.families for c in found.drives if c.families} == {}
