@@ -26,8 +26,8 @@ from robotid.cli.job import read_job
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulator import Noise, simulate
 from robotid.dynamics.simulation.truth import another_robot
+from robotid.robot.bodies import link_clouds
 from robotid.robot.examples import example_urdf
-from robotid.robot.geometry import link_clouds
 
 ROOT = Path(__file__).parents[1]
 GALLERY = ROOT / "build" / "gallery"

@@ -141,11 +141,7 @@ class Settings:
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Self:
-        """Return the settings of a table of a job file with keys and types of the ``schema``.
-
-        Args:
-            table: The table.
-        """
+        """Return the settings of a table of a job file with keys and types of the ``schema``."""
         given = {}
         for f, key, (*tables, last) in cls.entries():
             inside = table

@@ -3,9 +3,8 @@
 import numpy as np
 
 from robotid.base.exceptions import ModelError, SettingsError
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.typing import Array
-from robotid.data.log import suggestion
 from robotid.dynamics.simulation.simulation_settings import Truth
 from robotid.robot.drive_term import MemorylessTerm
 from robotid.robot.model import RobotModel

@@ -4,7 +4,7 @@ import pytest
 import trimesh
 
 from robotid.output.viewer.replays import _corners, ellipsoid, mass_marks, robot_scene, thin
-from robotid.robot.geometry import Surface
+from robotid.robot.bodies import Surface
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
