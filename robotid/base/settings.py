@@ -141,7 +141,11 @@ class Settings:
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Self:
-        """Return the settings of a table of a job file with keys and types of the ``schema``."""
+        """Return the settings of a table of a job file with keys and types of the ``schema``.
+
+        Args:
+            table: The table.
+        """
         given = {}
         for f, key, (*tables, last) in cls.entries():
             inside = table
