@@ -225,26 +225,23 @@ def run_procedure(
     return History(estimates, prx, tracking, loop.NA, loop.diverged, loop.skipped, torques)
 
 
+@dataclass
 class _Loop:
     """The state and the course of all runs."""
 
-    def __init__(
-        self,
-        dynamics: LinearDynamics,
-        plant: Plant,
-        motion: ProgramMotion,
-        settings: LoopSettings,
-        influences: Influences,
-        P0: Array,
-        offset: Array | float,
-    ) -> None:
-        R = len(P0)
-        self.dynamics, self.plant, self.motion = dynamics, plant, motion
-        self.settings, self.influences = settings, influences
+    dynamics: LinearDynamics
+    plant: Plant
+    motion: ProgramMotion
+    settings: LoopSettings
+    influences: Influences
+    P: Array  # (R, c), the estimates
+    offset: Array | float
+
+    def __post_init__(self) -> None:
+        R, settings, motion = len(self.P), self.settings, self.motion
         self.alpha, self.beta = (np.reshape(x, (-1, 1)) for x in (settings.alpha, settings.beta))
         self.dt = np.broadcast_to(np.asarray(motion.duration) / settings.updates, (R,))  # [s]
-        self.start = motion.evaluate(np.zeros(R))[0] + offset  # (R, n)
-        self.P = P0
+        self.start = motion.evaluate(np.zeros(R))[0] + self.offset  # (R, n)
         self.active = np.ones(R, dtype=bool)
         self.NA, self.diverged, self.skipped = (np.zeros(R, dtype=int) for _ in range(3))
         #: Estimates, PRX, distances and torques, by iteration.
@@ -292,14 +289,14 @@ class _Loop:
         sigma = smallest_eigenvalue(self.dynamics.mass_matrix(q, self.P))
         self.skipped = self.skipped + (self.active & (sigma <= 0.0))
         is_open = is_open & self.active
-        self.P = recursive_update(self.P, Psi, eta, sigma, is_open, eps2=self.settings.eps2)
+        eps2 = self.settings.eps2
+        self.P = recursive_update(self.P, Psi, eta, sigma, is_open, eps2=eps2)  # (24)
 
     def _update_once(self, samples: list[tuple[Array, Array]]) -> None:
-        G, G_star = (np.stack(part, axis=1) for part in zip(*samples, strict=True))
-        c, P = self.P.shape[1], self.P.copy()
+        G, G_star = (np.concatenate(part, axis=1) for part in zip(*samples, strict=True))
+        P = self.P.copy()
         for r in np.flatnonzero(self.active):
-            stacked = G[r].reshape(-1, c), G_star[r].reshape(-1, c)
-            P[r] = one_shot(*stacked, self.P[r], self.dynamics.names)
+            P[r] = one_shot(G[r], G_star[r], self.P[r], self.dynamics.names)  # (18)
         self.P = P
 
     def _reset_diverged(

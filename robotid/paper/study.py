@@ -37,10 +37,8 @@ from robotid.paper.procedure import (
 
 #: The three models and the form of the regressor of each.
 MODELS: dict[str, Form] = {
-    "printed": "printed",
-    "corrected": "corrected_five",
-    "physical": "corrected",
-}
+    "printed": "printed", "corrected": "corrected_five", "physical": "corrected",
+}  # fmt: skip
 AMPLITUDE = (1.0, 1.5)  # [rad] of the program motion
 DURATION = 2.0  # [s]
 PROGRAM = ProgramMotion(np.array(AMPLITUDE), DURATION)

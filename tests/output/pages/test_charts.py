@@ -224,7 +224,7 @@ def test_every_number_and_setting_of_a_chart_is_in_its_data():
         np.testing.assert_allclose(said["y"], own.y, rtol=1e-3)
         keys = {"label": own.label, "tone": own.tone, "kind": own.kind}
         assert {key: said[key] for key in keys} == keys
-        assert (said["faint"], said["hidden"]) == (own.is_weak, own.is_hidden)
+        assert (said["is_weak"], said["is_hidden"]) == (own.is_weak, own.is_hidden)
     np.testing.assert_allclose(found["series"][0]["half"], [0.0, 0.5, 1.0, 4.0], atol=1e-4)
     assert [said["half"] is None for said in found["series"]] == [False, True, True]
     assert found["spans"] == [[0.2, 0.5], [2.0, 30.0]]

@@ -9,9 +9,9 @@ import pytest
 from helpers.pages import bars
 
 from robotid.diagnosis.verdict.verdict import GOOD, POOR
-from robotid.output.report.errors import worst_errors
 from robotid.output.report.next_steps import Origin, next_steps
 from robotid.output.report.report_content import Residual, first_screen, torque_report, worst_second
+from robotid.output.report.tables import worst_errors
 
 ORIGIN = Origin(("arm.toml",), "out")
 
