@@ -153,17 +153,16 @@ def table(
 ) -> str:
     """Return the HTML of a table in a box that scrolls on narrow pages."""
     first = rows[0] if rows else [Cell("")] * len(headers)
-    kinds = ["number" if cell.kind == "number" else "text" for cell in first]
-    head = "".join(
-        f'<th scope="col" class="{kind}">{escape(title)}</th>'
-        for title, kind in zip(headers, kinds, strict=True)
-    )
+    head = ""
+    for title, cell in zip(headers, first, strict=True):
+        kind = "number" if cell.kind == "number" else "text"
+        head += f'<th scope="col" class="{kind}">{escape(title)}</th>'
     body = "".join(_row(row, is_data=is_data) for row in rows)
     last = f"<tfoot>{_row(foot)}</tfoot>" if foot else ""
-    title, kind = escape(caption), ' class="data"' if is_data else ""
+    title, data = escape(caption), ' class="data"' if is_data else ""
     return (
         f'<div class="scroll" tabindex="0" role="region" aria-label="{title}">'
-        f"<table{kind}><caption>{title}</caption>"
+        f"<table{data}><caption>{title}</caption>"
         f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody>{last}</table></div>\n"
     )
 
