@@ -206,13 +206,6 @@ class History:
         return error
 
 
-def random_torque(
-    share: float | Array, rng: np.random.Generator
-) -> Callable[[Array, Array], Array]:
-    """Return a disturbance v(t) (2), (11), uniform within a share of the control, per update."""
-    return lambda t, u: np.asarray(share * u * rng.uniform(-1.0, 1.0, u.shape))
-
-
 def run_procedure(
     dynamics: LinearDynamics,
     plant: Plant,
@@ -441,7 +434,8 @@ def _influences(cases: list[Case], rng: np.random.Generator) -> Influences:
     share = np.array([[case.torque] for case in cases])
     is_noisy = np.array([[float(case.noise)] for case in cases])
     noise = {key: level * is_noisy for key, level in _NOISE.items()}
-    return Influences(random_torque(share, rng), rng=rng, **noise)
+    # v(t) of (2), (11): uniform within a share of the control, drawn at each update
+    return Influences(lambda t, u: share * u * rng.uniform(-1.0, 1.0, u.shape), rng=rng, **noise)
 
 
 @dataclass(frozen=True)
