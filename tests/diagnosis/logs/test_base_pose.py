@@ -232,8 +232,6 @@ def test_a_right_twist_shows_that_the_quaternion_is_the_inverse(free):
 
 
 # --- IMU ------------------------------------------------------------------------------------------
-
-
 RAW = SignalSettings(cutoff=None, trim=0.0)
 G = np.array([0.0, 0.0, -9.81])
 TURN = pin.rpy.rpyToMatrix(0.4, 0.2, 1.0)  # axes of the IMU in the base

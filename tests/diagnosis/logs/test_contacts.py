@@ -144,8 +144,6 @@ def test_a_twist_with_the_axes_of_the_world_is_found(robot, walk, part):
 
 
 # --- measured forces ------------------------------------------------------------------------------
-
-
 SLOW = SignalSettings(cutoff=4.0)
 FOUR, PARTS = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT"), ("fx", "fy", "fz")
 

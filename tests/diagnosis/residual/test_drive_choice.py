@@ -7,7 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers import driven as helper
-from helpers.driven import ELBOW, JOINTS, LIFT, arm, driven, driven_log
+from helpers.driven import ELBOW, JOINTS, arm, driven, driven_log
 from helpers.stands import recorded, stand
 
 import robotid
@@ -15,7 +15,6 @@ from robotid.base.exceptions import SettingsError
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.residual.term_trials import Trials, take_sample
-from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.constraint_rows import without_forces
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
@@ -196,11 +195,6 @@ def test_of_families_alike_the_better_conditioned_is_chosen(plain, rising):
     names, C = stated.model.layout.names, stated.standard_covariance
     i, k = (names.index(f"{ELBOW}.{term}") for term in ("coulomb", "stribeck"))
     assert said.evidence["r"] == pytest.approx(C[i, k] / np.sqrt(C[i, i] * C[k, k]))
-    _, drives = parameter_entries(stated)
-    partner = {entry["name"]: entry.get("correlated_with") for entry in drives}
-    assert partner[f"{ELBOW}.coulomb"] == f"{ELBOW}.stribeck"
-    assert partner[f"{ELBOW}.stribeck"] == f"{ELBOW}.coulomb"
-    assert partner[f"{LIFT}.coulomb"] is None
 
 
 def rising_logs(found):
@@ -249,8 +243,6 @@ def test_what_is_nearly_chosen_widens_the_intervals_it_would_move(plain):
 
 
 # --- wrong bodies of a URDF -----------------------------------------------------------------------
-
-
 RATE, SECONDS, NOISE = 100.0, 24.0, 0.01  # [Hz], [s], of the standard deviation of each torque
 
 
@@ -277,8 +269,6 @@ def test_bodies_of_1_g_in_the_urdf_do_not_become_springs(tmp_path, seed):
 
 
 # --- constraint forces that are eliminated --------------------------------------------------------
-
-
 FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
 PLANTED = {"FL_HFE": 0.1, "HR_KFE": 0.1}  # excess of Stribeck friction [N m]
 

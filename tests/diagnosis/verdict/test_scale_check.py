@@ -211,8 +211,6 @@ def test_a_total_mass_that_torque_does_not_determine_contradicts_nothing(error, 
 
 
 # --- payloads of known mass -----------------------------------------------------------------------
-
-
 SHARP = PayloadCheck("tool0", 2.0, 2.02, 0.01, (2.0, 2.04), "loaded.csv", "ab")
 
 
@@ -261,8 +259,6 @@ def test_it_decides_before_the_urdf_and_a_contradiction_before_all():
 
 
 # --- stated masses --------------------------------------------------------------------------------
-
-
 def checked(model, log, **constraints):
     settings = EstimatorSettings(constraints=constraints)
     return check_scale(fit(model, [log], signals=EXACT, estimator=settings))
