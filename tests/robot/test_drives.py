@@ -20,11 +20,17 @@ from robotid.data.signals import process
 from robotid.dynamics import prediction
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.friction_projection import drive_moments, project_friction
-from robotid.dynamics.prediction import drive_motion_along, predict, remember
 from robotid.dynamics.rows import COMPILED, TrajectoryRows
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulator import RobotPlant
-from robotid.dynamics.torque import InstantRegressor, joint_torque_regressor, trajectory_regressor
+from robotid.dynamics.torque import (
+    InstantRegressor,
+    drive_motion_along,
+    joint_torque_regressor,
+    predict,
+    remember,
+    trajectory_regressor,
+)
 from robotid.output.files.mjcf import write_mjcf
 from robotid.output.files.urdf import load_identified, read_sidecar, write_urdf
 from robotid.output.report.pictures import friction_chart

@@ -22,7 +22,7 @@ from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.residual.misfit import Misfit, find_misfits
 from robotid.diagnosis.residual.term_trials import Accepted, Sample, Trials, along
-from robotid.dynamics.prediction import body_slopes, drive_torque, inverse_dynamics
+from robotid.dynamics.torque import body_slopes, drive_torque, inverse_dynamics
 from robotid.estimation.fitting.fitted import Fit
 from robotid.robot.model import RobotModel
 

@@ -19,9 +19,9 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import sentence_of
-from robotid.dynamics.prediction import predict, rigid_parts
 from robotid.dynamics.prepared_logs import independent_share
 from robotid.dynamics.rows import drive_values, friction_directions
+from robotid.dynamics.torque import predict, rigid_parts
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.fitted import Fit
 from robotid.robot.model import RobotModel

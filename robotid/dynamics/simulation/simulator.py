@@ -10,7 +10,6 @@ import pinocchio as pin
 from robotid.base.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.base.typing import Array, ProgressCallback, ignore_progress
 from robotid.data.log import Log, Trajectory
-from robotid.dynamics.prediction import predict, remember
 from robotid.dynamics.simulation.motions import Motion
 from robotid.dynamics.simulation.simulation_settings import (
     Actuator,
@@ -22,6 +21,7 @@ from robotid.dynamics.simulation.simulation_settings import (
     Simulation,
     by_joint,
 )
+from robotid.dynamics.torque import predict, remember
 from robotid.robot.bodies import link_transfer
 from robotid.robot.drive_term import DriveTerm, MemorylessTerm
 from robotid.robot.drives import Bristles, Lag

@@ -14,7 +14,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.diagnosis.logs.base_checks import check_base, check_wrenches
 from robotid.dynamics.constraint_rows import constraint_jacobian
-from robotid.dynamics.prediction import predict
+from robotid.dynamics.torque import predict
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

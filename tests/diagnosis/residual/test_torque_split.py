@@ -24,8 +24,7 @@ from robotid.diagnosis.residual.torque_split import (
     joint_torques,
     split_torque,
 )
-from robotid.dynamics.prediction import predict, remember
-from robotid.dynamics.torque import joint_torque_regressor
+from robotid.dynamics.torque import joint_torque_regressor, predict, remember
 from robotid.estimation.fitting.evaluation import evaluate_logs
 from robotid.estimation.fitting.recorded import hold_log
 from robotid.robot.drives import Harmonic, Hat, Lag, LoadFriction, Presliding, Spring, Stribeck
