@@ -298,8 +298,6 @@ def test_a_load_is_not_taken_for_another_gravity():
 
 
 # --- traps that the publishers of recordings warn of ----------------------------------------------
-
-
 JOBS = Path(__file__).parents[2] / "jobs"
 # what the notes of each set say, and the finding with the figure that tells it
 TRAPS = {
