@@ -31,15 +31,12 @@ PAGES = {
     "scaling": "evidence/speed.md",
     "workers": "how_to/long_logs.md",
     "memory": "how_to/long_logs.md",
-    "recursive": "how_to/online.md",
-    "replay": "how_to/replay.md",
     "verdict": "evidence/verdicts.md",
     "preview": "how_to/preview.md",
     "excitation": "evidence/excitation.md",
     "designs": "evidence/excitation.md",
     "motions": "evidence/excitation.md",
     "commands": "evidence/closed_loop.md",
-    "methods": "evidence/closed_loop.md",
 }
 BLOCK = re.compile(
     r"<!-- table of bench_(?P<name>\w+), (?P<digest>[-\w]+) -->\n"

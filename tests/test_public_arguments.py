@@ -48,12 +48,11 @@ def test_names_in_an_array_are_names(log):
     assert all(type(name) is str for name in made.joints)
 
 
-@pytest.mark.parametrize("column", [0, 1])
-def test_a_masked_value_is_no_value(log, column):
+def test_a_masked_value_is_no_value(log):
     q = np.ma.masked_array(log.q, mask=np.zeros_like(log.q, dtype=bool))
     assert np.array_equal(Log(**fields(log, q=q)).q, log.q)
-    q.mask[7, column] = True
-    with pytest.raises(DataError, match=rf"q_joint_{column + 1} is NaN at row 7"):
+    q.mask[7, 1] = True
+    with pytest.raises(DataError, match="q_joint_2 is NaN at row 7"):
         Log(**fields(log, q=q))
     whole = np.ma.masked_equal(np.arange(60), 7)  # whole numbers have no NaN
     with pytest.raises(DataError, match="time is NaN at row 7"):
@@ -161,12 +160,10 @@ def test_settings_of_any_kind_are_refused_in_words(name, value):
         SignalSettings(**{name: value})
 
 
-@pytest.mark.parametrize(("logs", "reference"), [([], "log"), ("log", [])])
-def test_a_payload_needs_logs_with_and_without_it(model, log, logs, reference):
-    given = [log if some == "log" else some for some in (logs, reference)]
-    name = "logs" if not given[0] else "reference"
-    with pytest.raises(DataError, match=rf"^{name} has no log, wanted at least one"):
-        payload(model, *given)
+def test_a_payload_needs_logs_with_and_without_it(model, log):
+    for name, logs in (("logs", ([], log)), ("reference", (log, []))):
+        with pytest.raises(DataError, match=rf"^{name} has no log, wanted at least one"):
+            payload(model, *logs)
 
 
 @pytest.fixture(scope="module")
@@ -196,9 +193,8 @@ CALLS_OF_A_RESULT = {
 @pytest.mark.parametrize("words", CALLS_OF_A_RESULT)
 def test_what_is_asked_of_a_result_is_checked(found, log, tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(RobotIdError) as error:
+    with pytest.raises(RobotIdError, match=rf"^{re.escape(words)}"):
         CALLS_OF_A_RESULT[words](found, log.q[:3])
-    assert str(error.value).startswith(words)
     assert not list(tmp_path.iterdir())
 
 
@@ -244,10 +240,6 @@ def test_a_sample_that_is_none_changes_nothing(model, t, q, tau, words):
     online.update(-1.0, [0.0, 0.0], [0, 0])  # earlier than the one that was refused
 
 
-def ghosts(*arrays):
-    return {"x": arrays}
-
-
 REFUSED = {
     "start is ": lambda m, log: log.window(log.q, 1.0),
     "end is ": lambda m, log: log.window(0.0, 10**400),
@@ -267,7 +259,7 @@ REFUSED = {
         m, log.t, log.q, masses={"y": m.standard_parameters(), "x": np.zeros(3)}
     ),
     "ghost 'x' has 3 arrays, wanted two": lambda m, log: robotid.replay(
-        m, log.t, log.q, ghosts=ghosts(log.t, log.q, log.q)
+        m, log.t, log.q, ghosts={"x": (log.t, log.q, log.q)}
     ),
     "log: joints.joint_2 is 5, wanted a name": lambda m, log: LogSource(
         joints={"joint_1": "a", "joint_2": 5}
@@ -284,17 +276,17 @@ REFUSED = {
 
 @pytest.mark.parametrize("words", REFUSED)
 def test_an_entry_of_another_kind_is_named(model, log, words):
-    with pytest.raises(RobotIdError) as error:
+    with pytest.raises(RobotIdError, match=rf"^{re.escape(words)}"):
         REFUSED[words](model, log)
-    assert str(error.value).startswith(words)
 
 
-@pytest.mark.parametrize("gain", [None, "x", np.nan, 0])
-def test_a_gain_that_is_no_number_is_refused(log, tmp_path, gain):
+def test_a_gain_that_is_no_number_is_refused(log, tmp_path):
     robotid.write_log(log, tmp_path / "log.csv")
-    gains = {"joint_1": 2.0, "joint_2": gain}
-    with pytest.raises(SettingsError, match=r"gain of 'joint_2' is .*, wanted a number other than"):
-        robotid.read_log(tmp_path / "log.csv", log.joints, gains=gains)
+    words = "gain of 'joint_2' is .*, wanted a number other than"
+    for gain in (None, "x", np.nan, 0):
+        gains = {"joint_1": 2.0, "joint_2": gain}
+        with pytest.raises(SettingsError, match=words):
+            robotid.read_log(tmp_path / "log.csv", log.joints, gains=gains)
 
 
 def test_flags_and_numbers_of_numpy_are_flags_and_numbers(log):
@@ -307,11 +299,17 @@ def test_flags_and_numbers_of_numpy_are_flags_and_numbers(log):
 JUNK = (5, 0.5, "x", [None], {1: 2}, object(), np.zeros(0), np.array(["a", "b", "c"]))
 
 
+@pytest.fixture(scope="module")
+def result(found, tmp_path_factory):
+    target = tmp_path_factory.mktemp("result")
+    return robotid.load_result(robotid.save_result(found, target, report=False))
+
+
 @pytest.mark.parametrize("junk", JUNK, ids=lambda x: type(x).__name__)
-def test_each_public_boundary_names_the_argument_and_its_type(model, log, junk, tmp_path):
+def test_each_public_boundary_names_the_argument_and_its_type(
+    model, log, found, result, junk, tmp_path
+):
     """No AttributeError, TypeError, KeyError or IndexError comes out of any of them."""
-    found = identify(model, log, validation=log)
-    result = robotid.load_result(robotid.save_result(found, tmp_path / "out"))
     pose = np.tile([0.0] * 6 + [1.0], (60, 1))
     segment = np.zeros(60, dtype=int)
     motion = robotid.Trajectory(log.t, log.q, log.q, log.q, log.tau, log.joints, 50.0, segment)
@@ -341,8 +339,7 @@ def test_each_public_boundary_names_the_argument_and_its_type(model, log, junk, 
     assert not (tmp_path / "other").exists()
 
 
-def test_a_result_from_torques_has_no_controller(model, log, tmp_path):
-    result = robotid.load_result(robotid.save_result(identify(model, log), tmp_path / "out"))
+def test_a_result_from_torques_has_no_controller(result, log):
     assert result.rate is None
     with pytest.raises(DataError, match=r"result.json is a result from torques, wanted one of"):
         result.open_loop(log)

@@ -44,23 +44,15 @@ _TRIM_THRESHOLD, _SPARE = -1, 2**26  # [bytes]
 _FIRST_LINE = re.compile(r'"""robotid ([a-z]+): (.+)\."""')
 
 
-def _commands() -> dict[str, str]:
-    """Return the help line of each command by name: the first line of its file, unimported."""
-    commands = {}
-    for path in sorted(Path(__file__).parent.glob("[a-z]*.py")):
-        with path.open(encoding="utf-8") as file:
-            first = _FIRST_LINE.match(file.readline())
-        if first:
-            commands[first[1]] = first[2]
-    return commands
-
-
-#: The help line of each command by name.
-COMMANDS = _commands()
+#: The help line of each command by name: the first line of its file, which is not imported.
+COMMANDS = {
+    first[1]: first[2]
+    for path in sorted(Path(__file__).parent.glob("[a-z]*.py"))
+    if (first := _FIRST_LINE.match(path.read_text(encoding="utf-8")))
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line."""
     code = 0
     gc.set_threshold(_OBJECTS)
     atexit.register(gc.freeze)  # no search for cycles in all that the end of the process frees
@@ -98,8 +90,8 @@ def _run(words: Sequence[str]) -> int:
         print_error(error)
         return 1
     except MemoryError as error:
-        remedy = "not enough memory; lower rates, shorten logs, or lock joints"
-        print_error(error, f"{remedy} ({error})" if str(error) else remedy)
+        size = f" ({error})" if str(error) else ""
+        print_error(error, f"not enough memory; lower rates, shorten logs, or lock joints{size}")
         return 1
     except KeyboardInterrupt as error:
         print_error(error, "interrupted")
@@ -111,8 +103,7 @@ def _keep_pages() -> None:
     """Reuse the memory of small arrays instead of returning it, where the C library is glibc."""
     if sys.platform != "linux":
         return
-    set_option = getattr(ctypes.CDLL(None), "mallopt", None)
-    if set_option is not None:
+    if set_option := getattr(ctypes.CDLL(None), "mallopt", None):
         set_option(_MMAP_THRESHOLD, _LARGE)
         set_option(_TRIM_THRESHOLD, _SPARE)
 
@@ -159,19 +150,18 @@ class CommandParser(argparse.ArgumentParser):
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
         """Parse words; refuse a flag that a command does not have, with the nearest flag."""
-        found, unknown = super().parse_known_args(args, namespace)
+        options, unknown = super().parse_known_args(args, namespace)
+        if not unknown or self._subparsers is not None:
+            return options, unknown
         flags = [word.partition("=")[0] for word in unknown if word.startswith("--")]
-        if flags and self._subparsers is None:
-            known = [flag for action in self._actions for flag in action.option_strings]
-            near = difflib.get_close_matches(flags[0], known, n=1)
-            hint = f"; did you mean {near[0]}?" if near else f"; see '{self.prog} --help'"
-            self.error(f"{flags[0]} is unknown{hint}")
-        if unknown and self._subparsers is None:
-            self.error(
-                f"{unknown[0]!r} is one word too many; a flag takes one word, as JOINT=NUMBER or "
-                f"A,B; see '{self.prog} --help'"
-            )
-        return found, unknown
+        hint = f"; see '{self.prog} --help'"
+        if not flags:
+            words = "is one word too many; a flag takes one word, as JOINT=NUMBER or A,B"
+            self.error(f"{unknown[0]!r} {words}{hint}")
+        known = [flag for action in self._actions for flag in action.option_strings]
+        if near := difflib.get_close_matches(flags[0], known, n=1):
+            hint = f"; did you mean {near[0]}?"
+        self.error(f"{flags[0]} is unknown{hint}")
 
     def error(self, message: str) -> NoReturn:
         """Print the arguments and a message, and exit with code 2."""
@@ -181,10 +171,9 @@ class CommandParser(argparse.ArgumentParser):
         """Return the help: the main flags and examples if there are any, else all flags."""
         if not self.main_flags:
             return super().format_help()
-        formatter = self._get_formatter()
+        formatter, shown = self._get_formatter(), {"--help-all", *self.main_flags}
         arguments = [action for action in self._actions if not action.option_strings]
-        shown = ("--help-all", *self.main_flags)
-        flags = [a for a in self._actions if {*shown} & {*a.option_strings}]
+        flags = [action for action in self._actions if shown & {*action.option_strings}]
         for title, actions in (("arguments", arguments), ("main flags", flags)):
             formatter.start_section(title)
             formatter.add_arguments(actions)
@@ -214,8 +203,6 @@ class CommandParser(argparse.ArgumentParser):
 
 
 class _StoreOnce(argparse._StoreAction):
-    """Store the value of a flag; refuse a second value."""
-
     def __call__(
         self,
         parser: argparse.ArgumentParser,

@@ -42,15 +42,13 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     content = compare(options.results, options.out)
-    show_found(content, options, partial(_show, is_verbose=options.verbose))
-    if options.out and not options.json:
-        print(f"\nwritten to {options.out}")
+    files = [options.out] if options.out else []
+    show_found(content, options, partial(_show, is_verbose=options.verbose), files)
 
 
 def _show(content: dict[str, Any], *, is_verbose: bool) -> None:
-    results = content["results"]
-    labels = [result["label"] for result in results]
-    for result in results:
+    labels = [result["label"] for result in content["results"]]
+    for result in content["results"]:
         verdict = result["verdict"]["status"]
         line = f"{result['label']}  {verdict:7} {result['estimator']:10} {result['path']}"
         echo(line, "   ", verdict)

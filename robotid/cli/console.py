@@ -30,8 +30,7 @@ def echo(text: str, indent: str = "", tone: str = "") -> None:
     print(tinted(wrapped(text, terminal_width(), indent), tone, tone, sys.stdout))
 
 
-def print_files(folder: str, names: Sequence[str]) -> None:
-    """Print the files that were written, one per line."""
+def print_files(names: Sequence[str], folder: str = "") -> None:
     print("\nwritten:", *(f"  {Path(folder) / name}" for name in names), sep="\n")
 
 
@@ -56,17 +55,16 @@ def print_causes(
     printed: Sequence[str] = (),
     none: str = "no findings",
 ) -> None:
-    """Print findings by cause, then their number."""
     from robotid.base.findings import grouped, tally
 
     shown = [f for f in findings if is_verbose or f.severity != "note"]
-    notes_hidden = [f for f in findings if f not in shown]
-    causes, others = grouped(shown, joints), grouped(notes_hidden, joints)
+    causes = grouped(shown, joints)
     for cause in causes:
         for message in cause.messages:
             if message not in printed:
                 echo(f"{cause.severity}: {cause.code}: {message}", "  ", cause.severity)
-    if summary := tally(causes, others, worst, " hidden (--verbose)") or none:
+    hidden = grouped([f for f in findings if f not in shown], joints)
+    if summary := tally(causes, hidden, worst, " hidden (--verbose)") or none:
         echo(summary)
 
 
@@ -75,15 +73,11 @@ def recordings_of(inputs: Sequence[Mapping[str, Any]], role: str) -> list[str]:
     paths = {Path(entry["path"]) for entry in inputs}
     names = [path.name for path in paths]
     files = {str(path): path.name if names.count(path.name) == 1 else str(path) for path in paths}
-    return [
-        window_name(files[str(Path(entry["path"]))] or "log", entry)
-        for entry in inputs
-        if entry["role"] == role
-    ]
+    entries = [entry for entry in inputs if entry["role"] == role]
+    return [window_name(files[str(Path(entry["path"]))] or "log", entry) for entry in entries]
 
 
 def window_name(name: str, entry: Mapping[str, Any]) -> str:
-    """Return the name of a recording with its window of the log."""
     return f"{name} {period(entry['start'], entry['end'])}"
 
 
@@ -102,6 +96,7 @@ def show_found(
     options: argparse.Namespace,
     show: Callable[[dict[str, Any]], None],
     files: Sequence[str] = (),
+    folder: str = "",
 ) -> None:
     """Print the result of a command and the files that it wrote, or the JSON alone."""
     with closed_output_ignored():
@@ -110,7 +105,7 @@ def show_found(
             return
         show(content)
         if files:
-            print_files(options.out, files)
+            print_files(files, folder)
 
 
 class Terminated(KeyboardInterrupt):

@@ -35,26 +35,25 @@ def convert(
     file = Path(path)
     check_file(Path(target), [file])
     opened = open_table(file, source)
-    found, by_joint = _standard_names(file.name, opened.names, source)
-    for joint in joints or ():
-        if joint not in by_joint:
-            raise DataError(
-                f"{file.name} has no joint {joint!r}; joints found: {listed(by_joint)}"
-                f"{suggestion(joint, by_joint)}"
-            )
-    wanted = tuple(by_joint) if joints is None else tuple(joints)
+    named, by_joint = _standard_names(file.name, opened.names, source)
+    wanted = list(by_joint if joints is None else joints)
+    if unknown := [joint for joint in wanted if joint not in by_joint]:
+        near = suggestion(unknown[0], by_joint)
+        raise DataError(
+            f"{file.name} has no joint {unknown[0]!r}; joints found: {listed(by_joint)}{near}"
+        )
     others = [x for x in opened.names if x in _SENSED or x.startswith(_OF_LINKS)]
-    found |= {name: name for name in others}
+    named |= {name: name for name in others}
     chosen = ["time", *(name for joint in wanted for name in by_joint[joint]), *others]
-    columns = [name for name in found if name in chosen]
-    even = with_even_stamps(opened, found["time"], source.stamp)
-    table = even.read([found[name] for name in columns])
-    write_columns({name: table[found[name]] for name in columns}, Path(target))
+    columns = [name for name in named if name in chosen]
+    even = with_even_stamps(opened, named["time"], source.stamp)
+    table = even.read([named[name] for name in columns])
+    write_columns({name: table[named[name]] for name in columns}, Path(target))
     is_local = opened.axes.get("wrench") == "link" and any(x.startswith("wrench_") for x in others)
     return {
-        "path": str(target), "samples": len(table[found["time"]]), "columns": columns,
-        "joints": list(wanted), "local": is_local,  # wrenches with the axes of their links
-        "ignored": [name for name in opened.names if name not in found.values()],
+        "path": str(target), "samples": len(table[named["time"]]), "columns": columns,
+        "joints": wanted, "local": is_local,  # wrenches with the axes of their links
+        "ignored": [name for name in opened.names if name not in named.values()],
     }  # fmt: skip
 
 
@@ -78,15 +77,13 @@ def _standard_names(
             f"{where} has several columns for {twice[0]!r}: {listed(both)}; keep one of them"
         )
     standard = dict(pairs)
-    if "time" not in standard:
-        raise DataError(
-            f"{where} has no column 'time'; columns found: {listed(names)}. Rename the time column"
-        )
-    if not by_joint:
-        raise DataError(
-            f"{where} has no column of a joint, as 'q_<joint>'; columns found: {listed(names)}. "
-            "Rename the columns of the joints"
-        )
+    for is_there, what, remedy in (
+        ("time" in standard, "'time'", "the time column"),
+        (by_joint, "of a joint, as 'q_<joint>'", "the columns of the joints"),
+    ):
+        if not is_there:
+            columns = f"columns found: {listed(names)}. Rename {remedy}"
+            raise DataError(f"{where} has no column {what}; {columns}")
     return standard, by_joint
 
 

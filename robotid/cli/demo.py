@@ -15,8 +15,7 @@ from robotid.data.files.read import write_log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Noise, Truth
-from robotid.dynamics.simulation.simulator import simulate
-from robotid.dynamics.simulation.truth import draw_parameters
+from robotid.dynamics.simulation.simulator import draw_parameters, simulate
 from robotid.estimation.work_plan import WorkPlan
 from robotid.identification.result import TorqueIdentification
 from robotid.robot.examples import example_urdf
@@ -69,4 +68,4 @@ def run(options: argparse.Namespace) -> None:
     error = identification.base - truth
     within = sum(abs(error) < 3 * identification.base_error)
     echo(f"\n{within} of {len(truth)} base parameters lie within 3 standard errors of the truth")
-    print_files(options.out, [*result["outputs"].values(), "result.json"])
+    print_files([*result["outputs"].values(), "result.json"], options.out)

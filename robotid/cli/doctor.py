@@ -61,19 +61,15 @@ def run(options: argparse.Namespace) -> int:
         findings = examine(job, model, progress=progress)
     content = findings_to_dict(findings) | {"joints": list(model.joints)}
     count = len({entry.path for entry in (*job.identification, *job.validation)})
-    shown = partial(_show, findings, model.joints, is_verbose=options.verbose, count=count)
-    show_found(content, options, shown)
+    show = partial(_show, findings, model.joints, is_verbose=options.verbose, count=count)
+    show_found(content, options, show)
     return 1 if blocking(findings, job.ignore) else 0
 
 
 def _show(
-    findings: Sequence[Finding],
-    joints: Sequence[str],
-    content: Mapping[str, Any],
-    *,
-    is_verbose: bool,
+    findings: Sequence[Finding], joints: Sequence[str], _: Mapping[str, Any], *, is_verbose: bool,
     count: int,
-) -> None:
+) -> None:  # fmt: skip
     worst = _worst_of(findings, joints)
     print_causes(findings, joints, is_verbose=is_verbose, worst=worst, none="")
     if all(finding.severity == "note" for finding in findings):
@@ -82,15 +78,13 @@ def _show(
 
 def _worst_of(findings: Sequence[Finding], joints: Sequence[str]) -> str:
     """Return the joint with the most errors, then the most warnings, then the largest figure."""
-    ranks = dict.fromkeys(joints, (0, 0, 0.0))
+    ranks = {joint: [0, 0, 0.0] for joint in joints}
     for finding in findings:
         (cause,) = grouped([finding], joints)
         for joint in cause.joints:
-            errors, warnings, share = ranks[joint]
-            ranks[joint] = (
-                errors + (cause.severity == "error"),
-                warnings + (cause.severity == "warning"),
-                max(share, finding.evidence.get("share", 0.0)),
-            )
+            rank = ranks[joint]
+            rank[0] += cause.severity == "error"
+            rank[1] += cause.severity == "warning"
+            rank[2] = max(rank[2], finding.evidence.get("share", 0.0))
     worst = max(ranks, key=lambda joint: ranks[joint], default="")
     return worst if any(ranks.get(worst, ())[:2]) else ""

@@ -13,12 +13,12 @@ from robotid.base.exceptions import SettingsError
 from robotid.base.files import check_file
 from robotid.base.findings import listed
 from robotid.base.typing import ProgressCallback
-from robotid.cli.console import echo, print_files, progress_of, show_found
+from robotid.cli.console import echo, progress_of, show_found
 from robotid.cli.job import JOB, ROBOT, Flags, Job, add_shown, as_job, job_from_flags, number
 from robotid.cli.logs import result_run
 from robotid.data.log import Log
 from robotid.design.clearance import Box, Clearance
-from robotid.design.design import Design, Designer, FourierBasis
+from robotid.design.design import Design, Designer, FourierBasis, design_stands, design_sweeps
 from robotid.design.excitation import (
     FARTHEST,
     ROUTES,
@@ -28,7 +28,6 @@ from robotid.design.excitation import (
 )
 from robotid.design.limits import LIMITS, Course, MotionLimits
 from robotid.design.previews import Preview, Run, preview_logs
-from robotid.design.routes import design_stands, design_sweeps
 from robotid.estimation.fitting.recorded import hold_log
 from robotid.output.report.motion_page import write_motion_page
 from robotid.robot.model import RobotModel
@@ -77,15 +76,12 @@ def excite(
     course = designer.course(design)
     if settings.kind in ROUTES:
         _check_jerk(course, model.joints)
-    expected: Preview | None = None
-    if report is not None:  # computed before any file is written: the motion may be too short
-        expected = _expected(job, model, design, settings, run, str(target))
     content = _content(designer, design, course, settings)
-    write_motion(design.motion, model.joints, design.duration, settings.points, target)
-    if report is not None and expected is not None:
+    if report is not None:  # first: the motion may be too short for a preview
+        expected = _expected(job, model, design, settings, run, str(target))
         write_motion_page(report, model, content, course, expected)
-        content["report"] = str(report)
-    return content
+    write_motion(design.motion, model.joints, design.duration, settings.points, target)
+    return content if report is None else content | {"report": str(report)}
 
 
 def _designer(
@@ -142,13 +138,9 @@ def _check_jerk(course: Course, joints: Sequence[str]) -> None:
 
 
 def _expected(
-    job: Job,
-    model: RobotModel,
-    design: Design,
-    settings: MotionSettings,
-    run: Run | None,
+    job: Job, model: RobotModel, design: Design, settings: MotionSettings, run: Run | None,
     path: str,
-) -> Preview:
+) -> Preview:  # fmt: skip
     """Return the expected standard errors of a log of the motion, with those of earlier logs."""
     t = np.arange(round(design.duration * settings.points) + 1) / settings.points
     q, v, a = design.motion.evaluate(np.minimum(t, design.duration))
@@ -160,7 +152,6 @@ def _expected(
 def _content(
     designer: Designer, design: Design, course: Course, settings: MotionSettings
 ) -> dict[str, Any]:
-    """Return the design as plain values."""
     model, names = designer.information.model, designer.information.mapping.base_names
     margins: dict[str, Any] = {}
     jerk, most, clearance = LIMITS.index("jerk"), design.used.copy(), course.clearance
@@ -171,12 +162,12 @@ def _content(
             joint = int(np.argmax(used))
             margins[name] = {"margin": 1.0 - float(used[joint]), "where": model.joints[joint]}
     if clearance is not None:
-        contact = design.contact
+        near = design.contact
         margins["collision"] = {
-            "margin": contact and contact.margin, "kept": contact and contact.required,
-            "where": contact and f"{contact.first} and {contact.second}",
-            "time": contact and contact.time, "unread": clearance.unread,
-            "left_alone": clearance.made_to, "built_near": clearance.built_near,
+            "margin": near and near.margin, "kept": near and near.required,
+            "where": near and f"{near.first} and {near.second}", "time": near and near.time,
+            "unread": clearance.unread, "left_alone": clearance.made_to,
+            "built_near": clearance.built_near,
         }  # fmt: skip
     content = {
         "robot": model.name, "joints": list(model.joints), "criterion": designer.name,
@@ -211,48 +202,33 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("--given", metavar="RESULT", help=words)
     words = "page to write about the motion: limits over time, expected standard errors"
     add("--report", metavar="PAGE.html", help=words)
-    _MOTION.add(parser)
+    MOTION.add(parser)
     add_shown(parser, "json", "progress")
     flags = parser.add_argument_group("the robot, instead of a job file")
     JOB.add(flags, ROBOT[:3])
 
 
 def run(options: argparse.Namespace) -> None:
-    job = job_from_flags(options)
-    settings = motion_settings(options)
+    job, settings = job_from_flags(options), MotionSettings.from_dict(MOTION.stated(options))
     with progress_of(options) as progress:
         content = excite(
             job, options.out, settings,
             given=options.given, report=options.report, progress=progress,
         )  # fmt: skip
-    show_found(content, options, _show)
-    if not options.json:
-        print_files("", [options.out, *([content["report"]] if "report" in content else [])])
+    files = [options.out, options.report] if options.report else [options.out]
+    show_found(content, options, _show, files)
 
 
-def motion_settings(options: argparse.Namespace) -> MotionSettings:
-    return MotionSettings.from_dict(_MOTION.stated(options))
-
-
-def _numbers(word: str) -> tuple[float, ...]:
-    """Return the numbers between commas, none if one of them is no number."""
-    try:
-        return tuple(float(number) for number in word.split(","))
-    except ValueError:
-        return ()
-
-
-def _boxes(words: Sequence[str], flag: str) -> tuple["Box", ...]:
+def _boxes(words: Sequence[str], flag: str) -> tuple[Box, ...]:
     """Return boxes that are stated as NAME=x0,y0,z0,x1,y1,z1, two corners [m]."""
     boxes = []
     for word in words:
-        name, _, numbers = word.partition("=")
-        x = _numbers(numbers)
-        if len(x) != 6 or not all(abs(number) <= FARTHEST for number in x):
-            raise SettingsError(
-                f"{flag} {word!r}: wanted NAME=x0,y0,z0,x1,y1,z1, the lower and the upper corner "
-                f"[m], within {FARTHEST:g} m"
-            )
+        name, _, corners = word.partition("=")
+        wanted = "NAME=x0,y0,z0,x1,y1,z1, the lower and the upper corner [m], "
+        wanted += f"within {FARTHEST:g} m"
+        x = [number(text, flag, wanted, repr(word)) for text in corners.split(",")]
+        if len(x) != 6 or not all(abs(place) <= FARTHEST for place in x):
+            raise SettingsError(f"{flag} {word!r}: wanted {wanted}")
         boxes.append(Box(name, (x[0], x[1], x[2]), (x[3], x[4], x[5])))
     return tuple(boxes)
 
@@ -262,7 +238,7 @@ def _clearance(word: str, flag: str) -> float | None:
 
 
 #: Flags of the settings of the motion.
-_MOTION = Flags(
+MOTION = Flags(
     MotionSettings(),
     {
         "--kind": ("kind", ""),
@@ -308,7 +284,6 @@ def _show(content: dict[str, Any]) -> None:
 
 
 def _margin(name: str, margin: Mapping[str, Any]) -> str:
-    """Return the smallest margin of a motion to a limit, as text."""
     if name != "collision":
         return f"{100 * margin['margin']:5.1f} %  {margin['where']}"
     text = "no pair of links or obstacles comes close"

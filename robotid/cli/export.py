@@ -52,14 +52,13 @@ def export(
                 f"not of {format}; remove it"
             )
     with TemporaryDirectory(prefix="robotid-") as folder:
-        path = (
-            result if isinstance(result, str | Path) else save_result(result, folder, report=False)
-        )
-        loaded = load_result(path)
+        if isinstance(result, Identification):
+            result = save_result(result, folder, report=False)
+        loaded = load_result(result)
         check_file(Path(target), loaded.files)
         written = writers()[format].export(loaded, Path(target), **stated)
     return {
-        "result": str(path), "format": format, "files": [*map(str, written.files)],
+        "result": str(result), "format": format, "files": [*map(str, written.files)],
         "not_stated": list(written.notes), "projected": dict(written.projected),
     }  # fmt: skip
 
@@ -73,9 +72,9 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     for name, having in options_of(formats()).items():
         words = {kind: option.words for kind, option in having.items()}
         first = next(iter(having.values()))
-        about: dict[str, Any] = {"type": first.kind, "metavar": first.metavar}
-        if first.among:
-            about = {"choices": first.among}
+        about: dict[str, Any] = {"choices": first.among}
+        if not first.among:
+            about = {"type": first.kind, "metavar": first.metavar}
         add(f"--{name.replace('_', '-')}", help=_by_format(words), **about)
     add_shown(parser, "json")
 

@@ -52,7 +52,7 @@ COLUMNS = {
     "payload": "known mass on its last link [kg], which checks the scale of the torques",
     "job": "job file with the settings",
 }
-_FILES = ("fleet.parquet", "fleet.json", "fleet.html")
+TABLE, CONTENT, PAGE = FILES = ("fleet.parquet", "fleet.json", "fleet.html")
 #: Folder of the identified units.
 UNITS = ".robotid-units"
 _RESULTS: Mapping[str, type] = {
@@ -64,7 +64,7 @@ _RESULTS: Mapping[str, type] = {
 
 @dataclass(frozen=True)
 class FleetUnit(Workload):
-    """A unit with its logs: the work of one task."""
+    """The work of one task."""
 
     unit: str
     logs: tuple[tuple[Path, float | None], ...]  # each with its known payload [kg]
@@ -86,15 +86,10 @@ class FleetUnit(Workload):
                 "the estimator is 'simulation', wanted one of torques, as 'consistent'; identify "
                 "robots from commands with robotid identify"
             )
-        return replace(
-            job,
-            urdf=self.urdf or job.urdf,
-            identification=tuple(LogEntry(path) for path, mass in self.logs if mass is None),
-            validation=(),
-            payload_checks=tuple(
-                PayloadEntry(path, mass) for path, mass in self.logs if mass is not None
-            ),
-        )
+        fitted = tuple(LogEntry(path) for path, mass in self.logs if mass is None)
+        checks = tuple(PayloadEntry(path, mass) for path, mass in self.logs if mass is not None)
+        urdf = self.urdf or job.urdf
+        return replace(job, urdf=urdf, identification=fitted, validation=(), payload_checks=checks)
 
 
 #: Rows of a unit in the table of results; a missing value has no key.
@@ -105,7 +100,7 @@ def read_fleet(
     path: str | Path, urdf: str | Path | None = None, job: str | Path | None = None
 ) -> list[FleetUnit]:
     """Return the units of a table, in the order of their first rows."""
-    source = Path(path)
+    source, by_unit = Path(path), defaultdict[str, list[_Row]](list)
     names, rows = read_text_table(source)
     for name in ("unit", "log"):
         if name not in names:
@@ -122,34 +117,33 @@ def read_fleet(
             )
     if not rows:
         raise DataError(f"{source.name} has no rows, wanted one for each log")
-    by_unit: dict[str, list[_Row]] = {}
     for number, cells in enumerate(rows, start=1):
         row = _Row(source, number, cells)
         for name in ("unit", "log"):
             if not cells[name]:
-                raise row.error(name, f"no value, wanted the {COLUMNS[name]}; fill it in, or "
-                                "remove the row")  # fmt: skip
-        by_unit.setdefault(cells["unit"], []).append(row)
+                words = f"no value, wanted the {COLUMNS[name]}; fill it in, or remove the row"
+                raise row.error(name, words)
+        by_unit[cells["unit"]].append(row)
     return [_unit(name, of_unit, urdf, job) for name, of_unit in by_unit.items()]
 
 
 @dataclass(frozen=True)
 class _Row:
-    """A row of the table."""
-
     source: Path
     number: int
     cells: Mapping[str, str]
 
     def error(self, column: str, words: str) -> DataError:
-        """Return the error of a column."""
-        return DataError(f"{self.source.name} row {self.number}, column {column!r}: {words}")
+        return DataError(f"{self._where(column)}: {words}")
+
+    def _where(self, column: str) -> str:
+        return f"{self.source.name} row {self.number}, column {column!r}"
 
     def path(self, column: str) -> Path:
         """Return a path, relative to the table, with $VARIABLES replaced as in job files."""
-        where = f"{self.source.name} row {self.number}, column {column!r}"
+        text, where = self.cells[column], self._where(column)
         try:
-            return stated_path(self.cells[column], where, self.source.parent, expand=True)
+            return stated_path(text, where, self.source.parent, expand=True)
         except SettingsError as error:
             raise DataError(str(error)) from error
 
@@ -169,7 +163,6 @@ class _Row:
 def _unit(
     name: str, rows: Sequence[_Row], urdf: str | Path | None, job: str | Path | None
 ) -> FleetUnit:
-    """Return a unit of the table from its rows."""
     first, seen = rows[0], dict[str, int]()
     for row in rows:
         for column in ("urdf", "job"):
@@ -184,18 +177,15 @@ def _unit(
         if log in seen:
             raise row.error("log", f"{log!r} is in row {seen[log]}, too; remove one of the rows")
         seen[log] = row.number
-    of_unit = {"urdf": urdf, "job": job}
-    files = {
-        column: first.path(column) if first.cells.get(column) else path and Path(path)
-        for column, path in of_unit.items()
-    }
-    if not any(files.values()):
-        raise first.error(
-            "urdf", f"the unit {name!r} has no URDF; fill it in, or state one for all units with "
-            "--urdf"
-        )  # fmt: skip
+    files = [
+        first.path(column) if first.cells.get(column) else Path(path) if path else None
+        for column, path in (("urdf", urdf), ("job", job))
+    ]
+    if not any(files):
+        words = f"the unit {name!r} has no URDF; fill it in, or state one for all units with --urdf"
+        raise first.error("urdf", words)
     logs = tuple((row.path("log"), row.payload) for row in rows)
-    return FleetUnit(name, logs, files["urdf"] or None, files["job"] or None)
+    return FleetUnit(name, logs, *files)
 
 
 def identify_unit(unit: FleetUnit, threads: int | None) -> UnitRows:
@@ -222,7 +212,6 @@ def identify_unit(unit: FleetUnit, threads: int | None) -> UnitRows:
 
 
 def _failure(unit: FleetUnit, error: Exception) -> dict[str, Any]:
-    """Return the row of a unit that is not identified."""
     text = "; ".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", [])])
     return {"unit": unit.unit, "status": "failed", "error": text}
 
@@ -233,19 +222,19 @@ def _rows(unit: str, logs: Sequence[Path], result: Mapping[str, Any]) -> Iterato
     common = {"unit": unit, "status": "done"}
     of_unit = {"verdict": verdict["status"], "reasons": "; ".join(verdict["reasons"])}
     for entry in result["base_parameters"]:
-        own = between["parameters"].get(entry["name"])
-        mean = own and {"value": own["mean"], "std_error": own["std_error"],
-                        "spread": own["spread"]}  # fmt: skip
-        plain = {"value": entry["value"], "std_error": entry["std_error"]}
+        varied = between["parameters"].get(entry["name"])
+        figures = {"value": entry["value"], "std_error": entry["std_error"]}
+        if varied:
+            figures = {"value": varied["mean"]} | {x: varied[x] for x in ("std_error", "spread")}
         yield {
             **common, **of_unit, "parameter": entry["name"], "parameter_unit": entry["unit"],
-            **(mean or plain), "robot": result["robot"], "expression": entry["expression"],
+            **figures, "robot": result["robot"], "expression": entry["expression"],
         }  # fmt: skip
     for k, path in enumerate(logs if between["parameters"] else ()):
-        for name, own in between["parameters"].items():
+        for name, varied in between["parameters"].items():
             yield {
-                **common, "log": str(path), "parameter": name, "parameter_unit": own["unit"],
-                "value": own["by_log"][k], "std_error": own["std_error_by_log"][k],
+                **common, "log": str(path), "parameter": name, "parameter_unit": varied["unit"],
+                "value": varied["by_log"][k], "std_error": varied["std_error_by_log"][k],
             }  # fmt: skip
 
 
@@ -254,7 +243,7 @@ def run_fleet(
 ) -> dict[str, Any]:
     """Identify all units; write fleet.parquet, fleet.json and fleet.html when all are finished."""
     target = Path(folder)
-    check_folder(target, _FILES)
+    check_folder(target, FILES)
     if not resume:
         shutil.rmtree(target / UNITS, ignore_errors=True)
     (target / UNITS).mkdir(parents=True, exist_ok=True)
@@ -279,12 +268,12 @@ def run_fleet(
                     gathered.add(rows)
                     yield from rows
 
-            write_rows(partial / "fleet.parquet", results(), _RESULTS)
-            outputs = {"table": _FILES[0], "page": _FILES[2]}
+            write_rows(partial / TABLE, results(), _RESULTS)
+            outputs = {"table": TABLE, "page": PAGE}
             content = {"robotid": __version__, "versions": code_versions(), "outputs": outputs}
             content |= gathered.content(units)
-            write_json(content, partial / "fleet.json")
-            write_text(fleet_page(content), partial / "fleet.html")
+            write_json(content, partial / CONTENT)
+            write_text(fleet_page(content), partial / PAGE)
     return content
 
 
@@ -322,7 +311,6 @@ class _Gathered:
         self._verdicts.update([row["verdict"] for row in rows if row.get("verdict")][:1])
 
     def content(self, units: Sequence[FleetUnit]) -> dict[str, Any]:
-        """Return the content of fleet.json."""
         several = {key: found for key, found in self._values.items() if len(found) >= FEWEST_RUNS}
         n_tests = sum(map(len, several.values()))
         parameters, unlike = [], []
@@ -347,14 +335,11 @@ class _Gathered:
                 for k, probability in different
             ]  # fmt: skip
         return {
-            "units": len(units),
-            "logs": sum(len(unit.logs) for unit in units),
-            "done": sum(self._verdicts.values()),
-            "verdicts": dict(self._verdicts),
-            "failures": self._failures,
-            "parameters": parameters,
+            "units": len(units), "logs": sum(len(unit.logs) for unit in units),
+            "done": sum(self._verdicts.values()), "verdicts": dict(self._verdicts),
+            "failures": self._failures, "parameters": parameters,
             "unlike": sorted(unlike, key=lambda entry: entry["probability"]),
-        }
+        }  # fmt: skip
 
 
 _SHOWN = 10  # failures and units that differ
@@ -379,7 +364,7 @@ def run(options: argparse.Namespace) -> int:
         workers = available_cores() if options.workers is None else options.workers
         plan = WorkPlan(workers, options.scheduler, progress)
         content = run_fleet(units, options.out, plan=plan, resume=options.resume)
-    show_found(content, options, _show, ["fleet.parquet", "fleet.html", "fleet.json"])
+    show_found(content, options, _show, [TABLE, PAGE, CONTENT], options.out)
     return 0 if content["done"] else 1
 
 
@@ -393,10 +378,8 @@ def _show(content: Mapping[str, Any]) -> None:
         echo(f"failed: {place}: {failure['error']}", "  ")
     for entry in unlike[:_SHOWN]:
         low, high = (f"{x:.3g}" for x in entry["others"])
-        echo(
-            f"differs: {entry['unit']}: {entry['parameter']} is {entry['value']:.4g} +- "
-            f"{entry['std_error']:.2g} {entry['parameter_unit']}; the other units predict {low} to "
-            f"{high}", "  ",
-        )  # fmt: skip
+        estimate = f"{entry['value']:.4g} +- {entry['std_error']:.2g} {entry['parameter_unit']}"
+        others = f"the other units predict {low} to {high}"
+        echo(f"differs: {entry['unit']}: {entry['parameter']} is {estimate}; {others}", "  ")
     if more := len(failures[_SHOWN:]) + len(unlike[_SHOWN:]):
         echo(f"{more} more failures or differences: fleet.html")

@@ -135,9 +135,8 @@ def identify(
                 "state validation, signals, controller and ignore there"
             )
         return identify_job(job, job.model(), WorkPlan(job.workers or 1, progress=progress))
-    require_kind(
-        estimator, (str, EstimatorSettings), "estimator", "a name or a robotid.EstimatorSettings"
-    )
+    kinds = (str, EstimatorSettings)
+    require_kind(estimator, kinds, "estimator", "a name or a robotid.EstimatorSettings")
     require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
     require_flag(doctor, "doctor")
     check_ignored(ignore)
@@ -213,8 +212,8 @@ def save_result(
     wanted = "a robotid.Identification"
     require_kind(identification, Identification, "identification", wanted)
     require_kind(folder, (str, Path), "folder", "the path of a folder")
-    require_kind(report, bool, "report", "True or False")
-    require_kind(replay, bool, "replay", "True or False")
+    require_flag(report, "report")
+    require_flag(replay, "replay")
     target = Path(folder)
     check_folder(target, ["result.json", *_names(identification.model)])
     job = replace(_job_of(identification), report=report, replay=replay)
@@ -223,7 +222,6 @@ def save_result(
 
 
 def _names(model: RobotModel) -> tuple[str, str, str, str]:
-    """Return the names of report, replay, URDF and sidecar."""
     stem = Path(model.tree.path).stem
     return "report.html", "replay.html", f"{stem}.identified.urdf", f"{stem}.identified.drive.json"
 
@@ -232,13 +230,12 @@ def _write(
     identification: Identification, job: Job, target: Path, *, source: Sequence[str] = ()
 ) -> tuple[Identification, dict[str, Any]]:
     """Write all files of a result; return the identification with its report, and result.json."""
-    model = identification.model
+    model, pi, outputs = identification.model, identification.standard, dict[str, str]()
     names = report, replay, urdf, sidecar = _names(model)
+    played = {"replay": replay} if job.replay else {}
+    written = {"urdf": urdf, "sidecar": sidecar} if identification.has_urdf else {}
     target.mkdir(parents=True, exist_ok=True)
     with folder_beside(target) as partial:
-        outputs = {}
-        played = {"replay": replay} if job.replay else {}
-        written = {"urdf": urdf, "sidecar": sidecar} if identification.has_urdf else {}
         if job.report:
             identification = replace(identification, report=str(target / report))
             links = {"result": "result.json", **written, **played}
@@ -246,7 +243,7 @@ def _write(
             write_report(identification, partial / report, files=links, origin=origin)
             outputs["report"] = report
         if written:
-            pi, moments = identification.standard, identification.moments if job.dynamics else {}
+            moments = identification.moments if job.dynamics else {}
             dynamics = job.dynamics and project_friction(model, pi, moments, DYNAMICS_TERMS)
             write_urdf(model, pi, partial / urdf, dynamics=dynamics)
         outputs |= written | played
@@ -260,7 +257,7 @@ def _write(
 
 def _replay_of(identification: Identification, job: Job, folder: Path) -> "Replay":
     """Return the replay of a result that is written in a folder; its modules are imported here."""
-    from robotid.cli.replay import read_findings, replay_files, replay_identified, stated_job
+    from robotid.cli.replay import read_findings, replay_files, replay_identified
 
     if isinstance(identification, TorqueIdentification):
         return replay_identified(identification)
@@ -271,13 +268,17 @@ def _replay_of(identification: Identification, job: Job, folder: Path) -> "Repla
             "their files; write the logs with robotid.write_log and identify from these files"
         )
     findings = read_findings([folder])
-    stated = stated_job(findings, job.urdf, entries[0].path)
+    stated = findings.job(job.urdf, entries[0].path)
     return replay_files(replace(stated, identification=entries[:1]), findings)
 
 
 def _job_of(identification: Identification) -> Job:
     """Return the job of an identification; one made in Python gets an equivalent job."""
-    model, asked = identification.model, identification.stated
+    model, asked, options = (
+        identification.model,
+        identification.stated,
+        identification.model.options,
+    )
     if isinstance(asked.job, Job):
         return asked.job
     chosen, loop = {}, getattr(identification, "loop", LoopSettings())
@@ -290,10 +291,9 @@ def _job_of(identification: Identification) -> Job:
         choice, terms = chosen.get(name), model.layout.own.get(name, ())
         stated = [term for term in terms if choice is None or term not in choice.terms]
         families = (wanted.get(name) or ()) if choice is None else choice.families
-        entries: tuple[str | DriveTerm, ...] = (*(() if is_auto else families), *stated)
+        entries: list[str | DriveTerm] = [*(() if is_auto else families), *stated]
         if entries:
-            drives[name] = entries
-    options = model.options
+            drives[name] = tuple(entries)
     return Job(
         urdf=Path(model.tree.path), joints=model.joints, locked=options["locked"],
         gravity=tuple(options["gravity"]), mimic=model.mimic,
@@ -308,9 +308,8 @@ def _job_of(identification: Identification) -> Job:
 
 def _entries(evaluations: Sequence[Evaluated]) -> tuple[LogEntry, ...]:
     """Return the windows of the logs that are in files."""
-    return tuple(
-        LogEntry(Path(e.log.path), e.extent.start, e.extent.end) for e in evaluations if e.log.path
-    )
+    files = [(Path(e.log.path), e.extent) for e in evaluations if e.log.path]
+    return tuple(LogEntry(path, extent.start, extent.end) for path, extent in files)
 
 
 def identify_job(
@@ -356,15 +355,15 @@ def _stages(choice: EstimatorSettings) -> Sequence[str]:
     """Return the stages of a job; the modules of a simulation are imported only for one."""
     if not isinstance(choice, SimulationSettings):
         return STAGES
-    from robotid.identification.closed_loop.stages import STAGES as stages
+    from robotid.identification.closed_loop import stages
 
-    return stages
+    return stages.STAGES
 
 
 def _identify_loops(
     job: Job, model: RobotModel, progress: ProgressCallback | None
 ) -> Identification:
-    """Identify by simulation, from commands or logged torques; no file is written."""
+    """Identify by simulation, from commands or logged torques."""
     from robotid.identification.closed_loop.from_commands import identify_loops
 
     assert isinstance(job.estimator, SimulationSettings)
@@ -402,14 +401,13 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     with progress_of(options) as progress:
         report_stage(progress, "reading logs")  # before what takes the first second: its modules
-
         job = job_from_flags(options)
         workers = job.workers if options.workers is None else options.workers
         plan = WorkPlan(workers, options.scheduler, progress=progress)
         source = source_words(options.words)
         identification, result = run_job(job, options.out, plan=plan, source=source)
     show = partial(show_result, findings=identification.findings, is_verbose=options.verbose)
-    show_found(result, options, show, [*result["outputs"].values(), "result.json"])
+    show_found(result, options, show, [*result["outputs"].values(), "result.json"], options.out)
     if not options.json:
         print_steps(next_steps(identification, Origin(source, options.out)))
     return 1 if result["verdict"]["log_errors"] else 0
@@ -418,7 +416,6 @@ def run(options: argparse.Namespace) -> int:
 def show_result(
     result: dict[str, Any], *, findings: Sequence[Finding] = (), is_verbose: bool = False
 ) -> None:
-    """Print an identification."""
     width, wls = terminal_width(), result.get("wls")
     echo(f"\n{result['robot']}: {len(result['joints'])} joints, {_found(result)}")
     roles = ("identification", "validation")
@@ -433,12 +430,10 @@ def show_result(
     print()
     verdict = result["verdict"]
     print_causes(
-        findings or [Finding(**entry) for entry in result["warnings"]],
-        result["joints"],
-        is_verbose=is_verbose,
-        worst="" if verdict["status"] == "good" else _worst(result),
+        findings or [Finding(**entry) for entry in result["warnings"]], result["joints"],
+        is_verbose=is_verbose, worst="" if verdict["status"] == "good" else _worst(result),
         printed=verdict["reasons"],
-    )
+    )  # fmt: skip
     print_verdict(verdict)
 
 
@@ -449,8 +444,8 @@ def _found(result: Mapping[str, Any]) -> str:
 
         fit, kind = (result["simulation"][key] for key in ("fit", "controller"))
         over = f" over {DRIFTS:g} s" if kind["kind"] == "torque" else ""
-        text = f"{fit['parameters']} free parameters; {fit['message']}; errors are position errors"
-        return text + over
+        free = f"{fit['parameters']} free parameters"
+        return f"{free}; {fit['message']}; errors are position errors{over}"
     structure, (before, after, _) = result["structure"], result["scale_check"]["masses"]
     assumed = " assumed" if result["scale_check"].get("assumed") else ""
     return (
@@ -462,16 +457,16 @@ def _found(result: Mapping[str, Any]) -> str:
 
 def _drive_lines(result: Mapping[str, Any]) -> list[str]:
     """Return the friction terms, or all parameters of drives and controllers of a simulation."""
+    varied = variation_lines(result.get("variation"))
     if "simulation" not in result:
-        lines = friction_lines(result["friction"]) + left_out_lines(result.get("left_out", ()))
-        return lines + variation_lines(result.get("variation"))
+        left_out = left_out_lines(result.get("left_out", ()))
+        return [*friction_lines(result["friction"]), *left_out, *varied]
     rows = []
     for entry in result["drive_parameters"]:
         if (error := entry["std_error"]) is not None:
             half = "at bound" if entry["source"] == "bound" else f"{error:.2g}"
             rows.append((entry["name"], f"{entry['value']:.4g}", half, entry["unit"]))
-    lines = columns(("parameter", "value", "+-", "unit"), rows)
-    return lines + variation_lines(result.get("variation"))
+    return columns(("parameter", "value", "+-", "unit"), rows) + varied
 
 
 def _worst(result: Mapping[str, Any]) -> str:
@@ -482,8 +477,6 @@ def _worst(result: Mapping[str, Any]) -> str:
         for joint, m in metrics["per_joint"].items()
         if m["relative_error_pct"] is not None
     ]
-    if not errors:
-        return ""
-    error, joint = max(errors)
+    error, joint = max(errors, default=(0.0, ""))
     kind = "position" if "simulation" in result else "torque"
-    return f"{joint}, {kind} error {error:.1f} %"
+    return joint and f"{joint}, {kind} error {error:.1f} %"

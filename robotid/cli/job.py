@@ -6,6 +6,7 @@ import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from robotid.base.exceptions import SettingsError
 from robotid.base.files import check_path, missing_file
 from robotid.base.findings import listed
 from robotid.base.settings import (
+    POSITIVE,
     Entries,
     Key,
     Range,
@@ -82,21 +84,19 @@ def _dump_terms(terms: Sequence[str]) -> dict[str, str | bool]:
 
 
 def _load_drives(table: Mapping[str, Sequence[Any]]) -> dict[str, tuple[str | DriveTerm, ...]]:
-    for joint, entries in table.items():
-        for entry in entries:
-            if isinstance(entry, str) and entry not in FAMILIES:
-                raise SettingsError(
-                    f"drives.{joint} has {entry!r}, wanted some of {listed(FAMILIES)}, or a table "
-                    "with the shape of a term"
-                )
     return {joint: tuple(_load_term(joint, e) for e in entries) for joint, entries in table.items()}
 
 
 def _load_term(joint: str, entry: Any) -> str | DriveTerm:  # noqa: ANN401
-    try:
-        return entry if isinstance(entry, str) else term_from_dict(entry)
-    except SettingsError as error:
-        raise SettingsError(f"drives.{joint}: {error}") from error
+    if not isinstance(entry, str):
+        try:
+            return term_from_dict(entry)
+        except SettingsError as error:
+            raise SettingsError(f"drives.{joint}: {error}") from error
+    if entry not in FAMILIES:
+        wanted = f"some of {listed(FAMILIES)}, or a table with the shape of a term"
+        raise SettingsError(f"drives.{joint} has {entry!r}, wanted {wanted}")
+    return entry
 
 
 def _dump_drives(drives: Mapping[str, Sequence[str | DriveTerm]]) -> dict[str, list[Any]]:
@@ -125,10 +125,9 @@ class PayloadEntry(Settings):
     path: Path = setting(MISSING, "the file, with the payload that the fitted logs lack",
                          at="log", **_FILE)  # fmt: skip
     mass: float = setting(
-        MISSING,
-        "known mass of the payload [kg]",
+        MISSING, "known mass of the payload [kg]",
         within=Range("more than 0 and less than 1e6", lambda x: 0 < x < 1e6),
-    )
+    )  # fmt: skip
     link: str = setting("", "link that carries it; the last moving link if not stated")
     start: float | None = setting(None, "start of the window in the log's own time [s]")
     end: float | None = setting(None, "end of the window [s]")
@@ -155,10 +154,9 @@ class Job(Settings):
         "independent", "independent, or coupled: a mimic joint moves with its leader"
     )
     snap_angles: bool = setting(
-        False,
-        "whether rounded angles of the URDF's joints, as 3.1416, are replaced by the nearest "
-        "multiple of pi/12",
-    )
+        False, "whether rounded angles of the URDF's joints, as 3.1416, are replaced by the "
+        "nearest multiple of pi/12",
+    )  # fmt: skip
     signals: SignalSettings = setting(SignalSettings(), "signal processing of the logs")
     terms: tuple[str, ...] = setting(
         (*DRIVE_TERMS, AUTO), "drive terms to identify", at="model", reads=_MODEL_KEYS,
@@ -169,17 +167,14 @@ class Job(Settings):
         "full; or static, for logs of poses and slow sweeps: velocities determine only the sign of "
         "friction, accelerations are not used; gravity parameters (masses, first moments), Coulomb "
         "friction and offsets are identified, the others have the URDF's values",
-        at="model.dynamics",
-        among=DYNAMICS,
-    )
+        at="model.dynamics", among=DYNAMICS,
+    )  # fmt: skip
     drives: Mapping[str, tuple[str | DriveTerm, ...]] = setting(
         {},
         "further friction of single joints, by joint: names as of friction, whose shape is "
         "identified, or a term with its shape, as { term = 'Harmonic', order = 101.0 }",
-        reads=Entries(dict, (list,)),
-        load=_load_drives,
-        dump=_dump_drives,
-    )
+        reads=Entries(dict, (list,)), load=_load_drives, dump=_dump_drives,
+    )  # fmt: skip
     gains: Mapping[str, float] = setting(
         {}, "torque per current of joints logged as current [N m/A or N/A]", at="torque.gains"
     )
@@ -209,21 +204,18 @@ class Job(Settings):
     )
     estimator: EstimatorSettings = setting(ConsistentSettings(), "estimator and its settings")
     controller: LoopSettings = setting(
-        LoopSettings(),
-        "position controller of the drives, for the estimator 'simulation'",
+        LoopSettings(), "position controller of the drives, for the estimator 'simulation'",
         dump=lambda loop: None if loop == LoopSettings() else loop.to_dict(),
-    )
+    )  # fmt: skip
     dynamics: bool = setting(
-        False,
-        "whether the identified friction is also written to <dynamics> of the URDF",
+        False, "whether the identified friction is also written to <dynamics> of the URDF",
         at="output.dynamics",
-    )
+    )  # fmt: skip
     report: bool = setting(True, "whether report.html is written", at="output.report")
     replay: bool = setting(
-        False,
-        "whether replay.html is written: the first validation log, or the first fitted log",
+        False, "whether replay.html is written: the first validation log, or the first fitted log",
         at="output.replay",
-    )
+    )  # fmt: skip
     identification: tuple[LogEntry, ...] = setting((), "logs to fit")
     validation: tuple[LogEntry, ...] = setting((), "validation logs")
     payload_checks: tuple[PayloadEntry, ...] = setting(
@@ -234,17 +226,13 @@ class Job(Settings):
         (), "codes of the doctor's findings to ignore", at="doctor.ignore"
     )
     rows_in_memory: int = setting(
-        2**17,
-        "total number of rows of all logs above which they are read in pieces",
-        at="reduction.rows_in_memory",
-        within=Range("a positive number", lambda x: x >= 1),
-    )
+        2**17, "total number of rows of all logs above which they are read in pieces",
+        at="reduction.rows_in_memory", within=POSITIVE,
+    )  # fmt: skip
     workers: int | None = setting(
-        None,
-        "worker processes for the pieces; one per core for long logs if not stated",
-        at="reduction.workers",
-        within=Range("1 to 1024", lambda x: 1 <= x <= 1024),
-    )
+        None, "worker processes for the pieces; one per core for long logs if not stated",
+        at="reduction.workers", within=Range("1 to 1024", lambda x: 1 <= x <= 1024),
+    )  # fmt: skip
 
     @classmethod
     def paths(cls) -> dict[str, Key]:
@@ -272,11 +260,9 @@ class Job(Settings):
         from robotid.robot.model import RobotModel
         from robotid.robot.prior import with_assumed_inertials
 
+        gears = [gear for gear in self.transmissions if gear.matrix != "urdf"]
         motors = [  # that move several joints
-            Coupling(joint, ratios, replaces=True)
-            for gear in self.transmissions
-            if gear.matrix != "urdf"
-            for joint, ratios in gear.shared.items()
+            Coupling(*shared, replaces=True) for gear in gears for shared in gear.shared.items()
         ]
         own_terms = {
             joint: [entry for entry in entries if isinstance(entry, DriveTerm)]
@@ -333,8 +319,7 @@ class Job(Settings):
 def read_job(path: str | Path) -> Job:
     require_kind(path, (str, Path), "path", "the path of a job file")
     check_path(path)
-    source = Path(path)
-    if not source.is_file():
+    if not (source := Path(path)).is_file():
         raise SettingsError(missing_file(source, "job file"))
     try:
         table = tomllib.loads(text := source.read_text(encoding="utf-8-sig"))
@@ -354,9 +339,8 @@ def job_file(model: object) -> Job:
     """Return the job of a file that is given in place of a robot and its logs."""
     if isinstance(model, str | Path) and Path(model).suffix == ".toml":
         return read_job(model)
-    raise SettingsError(
-        "no log is given, wanted the robot and its logs, or a job file (.toml) alone"
-    )
+    wanted = "the robot and its logs, or a job file (.toml) alone"
+    raise SettingsError(f"no log is given, wanted {wanted}")
 
 
 def as_job(robot: Job | str | Path) -> Job:
@@ -370,18 +354,18 @@ def as_job(robot: Job | str | Path) -> Job:
 def job_from_settings(
     table: Mapping[str, Any], where: str, folder: Path, *, expand: bool = False
 ) -> Job:
-    """Return the job that a table states."""
     check_keys(table, Job.schema(), where)
     if "urdf" not in table:
         raise SettingsError(f"{where} has no key 'urdf'; name the robot's URDF file")
-    whole = dict(table, urdf=stated_path(table["urdf"], where, folder, expand=expand))
+
+    def path(text: str) -> Path:
+        return stated_path(text, where, folder, expand=expand)
+
+    placed = dict(table, urdf=path(table["urdf"]))
     for key in ("identification", "validation", "payload_check"):
-        whole[key] = [
-            dict(entry, log=stated_path(entry["log"], where, folder, expand=expand))
-            for entry in table.get(key, [])
-        ]
+        placed[key] = [dict(entry, log=path(entry["log"])) for entry in table.get(key, [])]
     try:
-        return Job.from_dict(whole)
+        return Job.from_dict(placed)
     except SettingsError as error:
         raise SettingsError(f"{where}: {error}") from error
 
@@ -393,7 +377,6 @@ def written_job(settings: Mapping[str, Any], where: str) -> Job:
 
 
 def stated_path(text: str, where: str, folder: Path, *, expand: bool) -> Path:
-    """Return a path relative to a folder."""
     try:
         check_path(text)
     except SettingsError as error:
@@ -404,7 +387,7 @@ def stated_path(text: str, where: str, folder: Path, *, expand: bool) -> Path:
     return folder / expanded
 
 
-def number(word: str, flag: str, wanted: str = "a number", shown: str = "") -> float:
+def number(word: str, flag: str, wanted: str, shown: str = "") -> float:
     try:
         return float(word)
     except ValueError as error:
@@ -420,7 +403,7 @@ def pairs(words: Sequence[str], flag: str) -> dict[str, float]:
 
 def _once(words: Sequence[str], flag: str) -> dict[str, str]:
     """Return the texts of words like JOINT=TEXT by joint; refuse two of one joint."""
-    texts: dict[str, str] = {}
+    texts = dict[str, str]()
     for word in words:
         name, _, value = word.partition("=")
         if texts.setdefault(name, value) != value:
@@ -508,16 +491,12 @@ def _in(table: Any, at: str) -> Any:  # noqa: ANN401
 def _reader(kinds: Any) -> Callable[[Any, str], Any]:  # noqa: ANN401
     """Return the conversion from words to a setting of given types, as of ``Settings.schema``."""
     if isinstance(kinds, Entries):
-        return pairs if kinds.outer is dict else _listed
+        return pairs if kinds.outer is dict else lambda words, _: ",".join(words).split(",")
     if dict in kinds:
         return _of_all_or_pairs
     if {bool, float} <= {*kinds}:
         return lambda word, flag: word != "false" and number(word, flag, "a number or false")
     return lambda value, _: value
-
-
-def _listed(words: Sequence[str], _: str) -> list[str]:
-    return [name for word in words for name in word.split(",")]
 
 
 #: Flags of the keys of a job file.
@@ -569,9 +548,9 @@ OUTPUT = ("--dynamics", "--no-report", "--replay")
 #: Flags of a tracked or replayed log.
 ONLINE = tuple(
     flag
-    for flag, (key, _) in JOB.keys.items()
+    for flag in LOG
     if flag in ("--rate", "--cutoff", "--min-velocity")
-    or (flag in LOG and not key.startswith(("signals.", "doctor.")))
+    or not JOB.keys[flag][0].startswith(("signals.", "doctor."))
 )
 #: Flags of a bag or of foreign tables.
 SOURCE = ("--topic", "--command-topic", "--effort", "--stamp")
@@ -579,10 +558,7 @@ SOURCE = ("--topic", "--command-topic", "--effort", "--stamp")
 ROBOT = ("--joints", "--lock", "--snap-angles", "--time-unit", "--angle-unit")
 #: Flags of a motion without torques.
 MOTION = tuple(
-    flag
-    for flag, (key, _) in JOB.keys.items()
-    if flag in LOG and not key.startswith(("torque.", "doctor."))
-    if flag not in ("--effort", "--torque-delay")
+    flag for flag in LOG if flag not in ("--gain", "--ignore", "--effort", "--torque-delay")
 )
 _SHOWN = {
     "json": "print one JSON object",
@@ -598,13 +574,11 @@ def add_shown(parser: argparse.ArgumentParser, *names: str, **words: str) -> Non
 
 
 def add_out(parser: argparse.ArgumentParser, folder: str) -> None:
-    """Add the folder to write to."""
     words = f"folder to write to; default: {folder}"
     parser.add_argument("--out", default=folder, metavar="DIR", help=words)
 
 
 def add_work(parser: "argparse._ActionsContainer", default: str) -> None:
-    """Add the flags of worker processes and clusters."""
     words = f"worker processes; default: {default}"
     parser.add_argument("--workers", type=int, metavar="N", help=words)
     words = "address of a Dask cluster, as tcp://host:8786"
@@ -635,28 +609,22 @@ def job_from_flags(options: argparse.Namespace) -> Job:
         kind = "motion" if hasattr(options, "given") else "log"  # of preview
         one = kind.upper()
         raise SettingsError(f"no {kind} is given; wanted URDF {one} [{one} ...], or JOB.toml")
-    validation = getattr(options, "validate", None) or ()
-    table = {
-        "urdf": options.source,
-        "identification": [{"log": log} for log in logs],
-        "validation": [{"log": log} for log in validation],
-        **JOB.stated(options),
-    }
-    return job_from_settings(table, "command line", Path())
+    table = {"urdf": options.source, "identification": [{"log": log} for log in logs]}
+    table["validation"] = [{"log": log} for log in getattr(options, "validate", None) or ()]
+    return job_from_settings(table | JOB.stated(options), "command line", Path())
 
 
 def source_words(words: Sequence[str]) -> tuple[str, ...]:
     """Return the words of a command line that determine the identification."""
-    _, *rest = words
-    source, shown = list[str](), ("--json", "--progress", "--verbose")
-    for before, word in zip(words, rest, strict=False):
-        if before != "--out" and word not in (*shown, "--out") and not word.startswith("--out="):
-            source.append(word)
-    return tuple(source)
+    others = ("--json", "--progress", "--verbose", "--out")
+    return tuple(
+        word
+        for before, word in pairwise(words)
+        if before != "--out" and word not in others and not word.startswith("--out=")
+    )
 
 
 def refuse_log_flags(options: argparse.Namespace, why: str) -> None:
-    """Refuse the flags of the reading of logs."""
     if given := _given(options):
         raise SettingsError(f"{why}; remove {listed(given)}")
 

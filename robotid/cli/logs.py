@@ -38,6 +38,7 @@ _SHORTEST = 256  # rows of a piece
 
 #: Called with a log that cannot be read, in place of raising the error.
 Refuse: TypeAlias = Callable[[LogEntry, DataError], None]
+Surveyed: TypeAlias = tuple[SurveyedLog, ...]
 
 
 def survey_logs(
@@ -46,15 +47,16 @@ def survey_logs(
     *groups: Sequence[LogEntry],
     refuse: Refuse | None = None,
     needs: Needs = "torque",
-) -> tuple[tuple[SurveyedLog, ...], ...]:
+) -> tuple[Surveyed, ...]:
     """Return the logs of each group, ready to be read."""
     paths = dict.fromkeys(entry.path for entry in chain(*groups))
     opened = {path: _open(job, model, path, needs) for path in paths}
-    rows = sum(map(_count, opened.values()))
+    tables = [file[1].rows for file in opened.values() if not isinstance(file, DataError)]
+    rows = sum(table.count() for table in tables if table is not None)  # if not only read whole
     is_long = rows > job.rows_in_memory and not model.is_static
     length = max(job.rows_in_memory // _PIECES, _SHORTEST) if is_long else None
 
-    def survey(entries: Sequence[LogEntry]) -> tuple[SurveyedLog, ...]:
+    def survey(entries: Sequence[LogEntry]) -> Surveyed:
         logs = []
         units_of_logs(entries)
         for entry in entries:
@@ -107,18 +109,9 @@ def examine(
     return by_severity([*refused, *notes, *examine_logs(job, model, first, second)])
 
 
-#: A job, its robot, its logs to fit, its validation logs, and notes on them.
-LockedLogs: TypeAlias = tuple[
-    Job, RobotModel, tuple[SurveyedLog, ...], tuple[SurveyedLog, ...], tuple[Finding, ...]
-]
-
-
 def locked_as_logged(
-    job: Job,
-    model: RobotModel,
-    fitted: tuple[SurveyedLog, ...],
-    validation: tuple[SurveyedLog, ...],
-) -> LockedLogs:
+    job: Job, model: RobotModel, fitted: Surveyed, validation: Surveyed
+) -> tuple[Job, RobotModel, Surveyed, Surveyed, tuple[Finding, ...]]:
     """Return the job with joints locked at their positions in the logs, unless it states them."""
     logged, logs = {}, (*fitted, *validation)
     for joint in [joint for joint in model.locked if joint not in job.placed(model)]:
@@ -144,10 +137,9 @@ def examine_logs(
     job: Job, model: RobotModel, fitted: Sequence[SurveyedLog], validation: Sequence[SurveyedLog]
 ) -> tuple[Finding, ...]:
     """Examine surveyed logs: the locked joints of the job, then the windows of the logs."""
-    findings: list[Finding] = []
+    findings, placed = list[Finding](), job.placed(model)
     for log in (*fitted, *validation):
-        name = Path(log.path).name
-        findings += check_locked(model, log.locked, name, job.placed(model), job.units)
+        findings += check_locked(model, log.locked, Path(log.path).name, placed, job.units)
         if len(log.windows) > 1:  # the windows have no notes of their own
             findings += log_findings([log.head])
     first, second = ([look for log in logs for look in log.looks] for logs in (fitted, validation))
@@ -196,11 +188,6 @@ def _open(
     return layout, replace(table, read=lambda wanted: read(tuple(wanted)))
 
 
-def _count(file: tuple[LogLayout, Table] | DataError) -> int:
-    """Return the approximate number of rows of a file, 0 if it is only read whole."""
-    return 0 if isinstance(file, DataError) or file[1].rows is None else file[1].rows.count()
-
-
 def log_of_commands(job: Job, entry: LogEntry, result: Result) -> Log:
     """Return a log with the inputs of the simulated robot, gravity compensation included."""
     from robotid.identification.closed_loop.from_commands import driven_log, with_gravity
@@ -212,5 +199,5 @@ def log_of_commands(job: Job, entry: LogEntry, result: Result) -> Log:
 
 
 def needed_of(controller: LoopSettings) -> Needs:
-    """Return the signals that a simulation requires of a log in addition to positions."""
+    """Return the signals, besides positions, that a simulation requires of a log."""
     return "torque" if controller.kind == "torque" else "commands"

@@ -9,9 +9,8 @@ from robotid.cli.job import add_out, add_shown
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
     add_out(parser, "robotid-paper")
-    parser.add_argument(
-        "--quick", action="store_true", help="few iterations and motions, as a trial"
-    )
+    words = "few iterations and motions, as a trial"
+    parser.add_argument("--quick", action="store_true", help=words)
     add_shown(parser, "progress", json="print paper.json")
 
 
@@ -22,10 +21,8 @@ def run(options: argparse.Namespace) -> None:
     few = PaperSettings(iterations=5, longest=5, runs=5, patience=5)
     with progress_of(options) as progress:
         result = run_paper(options.out, settings=few if options.quick else None, progress=progress)
-    show_found(result, options, _show)
-    if not options.json:
-        files = "paper.html, paper.json, replay.html"
-        print(f"\nwritten to {options.out}: {files}")
+    files = ("paper.html", "paper.json", "replay.html")
+    show_found(result, options, _show, files, options.out)
 
 
 def _show(result: dict[str, Any]) -> None:

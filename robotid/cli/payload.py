@@ -1,7 +1,7 @@
 """robotid payload: identify a payload from a log with it and a log without it."""
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,6 @@ _STAGES = ("reading logs", "fitting")
 
 
 def is_result(path: str | Path) -> bool:
-    """Return whether a reference is a result or its folder, not a log."""
     return Path(path).suffix == ".json" or (Path(path) / "result.json").is_file()
 
 
@@ -49,8 +48,7 @@ def stated_masses(words: Sequence[str], links: Sequence[str]) -> dict[str, float
                 f"--mass {word}: the link is ambiguous, wanted one of {listed(links)}. "
                 "Write --mass LINK=KG"
             )
-        known = number(mass, "--mass", "KG or LINK=KG", repr(word))
-        masses[link or next(iter(links), "")] = known
+        masses[link or links[0]] = number(mass, "--mass", "KG or LINK=KG", repr(word))
     return masses
 
 
@@ -67,31 +65,27 @@ def measure_payload(
     entries = [LogEntry(Path(path)) for path in references]
     if any(map(is_result, references)):
         if len(references) > 1:
-            raise SettingsError(
-                f"references are {listed(references)}, wanted one result alone, or logs"
-            )
-        job, entries = job_of_result(
-            job, references[0], "give a log without the payload: --reference LOG"
-        )
+            wanted = "wanted one result alone, or logs"
+            raise SettingsError(f"references are {listed(references)}, {wanted}")
+        advice = "give a log without the payload: --reference LOG"
+        job, entries = job_of_result(job, references[0], advice)
     report_stage(progress, "reading logs", _STAGES)
     model = job.model()
     unknown = [joint for joint in model.joints if joint not in job.gains] if find_gains else []
     job = replace(job, gains={**job.gains, **dict.fromkeys(unknown, 1.0)})
     links = tuple(links) or usual_links(model)
     surveyed = survey_logs(job, model, job.identification, entries)
-    mapping = structural_mapping(model)
+    mapping, known = structural_mapping(model), stated_masses(masses, links)
     loaded, reference = (Recordings(model, mapping, logs) for logs in surveyed)
-    known = stated_masses(masses, links)
     report_stage(progress, "fitting", _STAGES)
 
     def rescaled(gains: Mapping[str, float]) -> Recordings:
         (runs,) = survey_logs(replace(job, gains={**job.gains, **gains}), model, entries)
         return Recordings(model, mapping, runs)
 
-    found = fit_with_friction(
+    return fit_with_friction(
         loaded, reference, job.friction, rescaled, links=links, masses=known, unknown_gains=unknown
-    )
-    return found.to_dict()
+    ).to_dict()
 
 
 def check_payloads(
@@ -158,7 +152,7 @@ def _show(content: dict[str, Any]) -> None:
 
 
 def _print_one_payload(found: Mapping[str, Any], check: Mapping[str, Any] | None) -> None:
-    link, (low, high) = found["link"], found["mass_interval"]
+    link = found["link"]
     mass, error = in_digits_of(found["mass"], found["mass_std_error"])
     print(f"payload on {link}")
     if error == "-":
@@ -166,15 +160,17 @@ def _print_one_payload(found: Mapping[str, Any], check: Mapping[str, Any] | None
         if check is not None:
             echo(f"  scale of the torques: {check['message']}", "  ")
     else:
-        low, high = (in_digits_of(end, found["mass_std_error"])[0] for end in (low, high))
+        low, high = (
+            in_digits_of(end, found["mass_std_error"])[0] for end in found["mass_interval"]
+        )
+        scale = "torque gains that are too large give a mass that is too large"
         echo(
             f"  mass {mass} kg (95 % interval {low} to {high}). It is proportional to the torque "
-            "scale: torque gains that are too large give a mass that is too large",
-            "  ",
-        )
+            f"scale: {scale}", "  ",
+        )  # fmt: skip
     if found["com"] is not None:
         print(f"  centre of mass in the frame of {link} [m]")
-        _print_values("xyz", found["com"], found["com_std_error"])
+        _print_values(zip("xyz", found["com"], found["com_std_error"], strict=True))
     if found["inertia"] is not None:
         for where, key, errors in (
             ("its centre of mass", "inertia", found["inertia_std_error"]),
@@ -182,22 +178,18 @@ def _print_one_payload(found: Mapping[str, Any], check: Mapping[str, Any] | None
         ):
             echo(f"  inertia about {where}, axes of {link} [kg m^2]", "  ")
             upper = [(i, j) for i in range(3) for j in range(i, 3)]
+            inertia = found[key]
             _print_values(
-                [f"I{'xyz'[i]}{'xyz'[j]}" for i, j in upper],
-                [found[key][i][j] for i, j in upper],
-                [errors[i][j] for i, j in upper],
+                ("I" + "xyz"[i] + "xyz"[j], inertia[i][j], errors[i][j]) for i, j in upper
             )
     for name, reason in found["reasons"].items():
         what = "centre of mass" if name == "com" else name
         echo(f"  {what}: not determined; {reason}", "  ")
 
 
-def _print_values(
-    names: Sequence[str], values: Sequence[float], errors: Sequence[float | None]
-) -> None:
-    """Print values in the digits of their errors, a row for each."""
+def _print_values(values: Iterable[tuple[str, float, float | None]]) -> None:
     rows = []
-    for name, value, error in zip(names, values, errors, strict=True):
+    for name, value, error in values:
         shown, half = in_digits_of(value, error)
         rows.append([name, shown, "" if half == "-" else f"+- {half}"])
     print("\n".join(f"  {line}" for line in columns(["", "", ""], rows, left=(0, 2))[1:]))

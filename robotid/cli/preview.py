@@ -40,54 +40,52 @@ def preview_job(
     correlation: float | None = None,
 ) -> dict[str, Any]:
     """Preview the logs of a job from their positions alone."""
-    stated: dict[str, Any] = {"noise": noise, "correlation": correlation}
     if not job.identification:
         raise DataError("no motion is given, wanted at least one to preview")
+    about: dict[str, Any] = {"noise": noise, "correlation": correlation}
     if given is None:
         model = job.model()
         motions = _motions(job, model, job.identification)
-        return build_preview(preview_logs(model, motions, job.estimator, **stated))
+        return build_preview(preview_logs(model, motions, job.estimator, **about))
     job, fitted, model, run = result_run(job, given)
     result = load_result(given).content
     hashes = fitted_hashes(result)
-    is_fitted = {entry.path: file_sha256(entry.path) in hashes for entry in job.identification}
-    if not any(is_fitted.values()):
+    new = [x.path for x in job.identification if file_sha256(x.path) not in hashes]
+    if len(new) == len(job.identification):
         motions = _motions(job, model, job.identification)
-        found = preview_logs(model, motions, job.estimator, run=run, **stated)
+        preview = preview_logs(model, motions, job.estimator, run=run, **about)
         between = stated_between(result, model)
-        return build_preview(replace(found, between=(between,) * len(motions)))
-    if not all(is_fitted.values()):
-        new = listed([path for path, own in is_fitted.items() if not own])
+        return build_preview(replace(preview, between=(between,) * len(motions)))
+    if new:
         raise DataError(
-            f"the given result was fitted to some of these motions, but not to {new}; preview "
-            "fitted logs and new motions separately"
+            f"the given result was fitted to some of these motions, but not to {listed(new)}; "
+            "preview fitted logs and new motions separately"
         )
     motions = _motions(job, model, fitted)
-    alone = preview_logs(model, motions, job.estimator, like=run, **stated)
+    alone = preview_logs(model, motions, job.estimator, like=run, **about)
     return _with_achieved(build_preview(alone), result)
 
 
 def _motions(job: Job, model: RobotModel, entries: Sequence[LogEntry]) -> list[SurveyedLog]:
     """Return motions in memory, read without their torques."""
-    found = []
+    motions = []
     for entry in entries:
-        layout, table = job.lay_out(entry, model, needs="motion")
+        file = job.lay_out(entry, model, needs="motion")
         window = entry.start, entry.end
-        found.append(survey_log(layout, table, model, job.signals, window, length=None))
-    return found
+        motions.append(survey_log(*file, model, job.signals, window, length=None))
+    return motions
 
 
 def _with_achieved(content: dict[str, Any], result: Mapping[str, Any]) -> dict[str, Any]:
     """Return a preview with the achieved standard errors of a result of the same logs."""
-    found = {entry["name"]: entry["std_error"] for entry in result["base_parameters"]}
-    ratios = []
+    std_errors = {entry["name"]: entry["std_error"] for entry in result["base_parameters"]}
     for entry in content["base_parameters"]:
-        achieved, expected = found.get(entry["name"]), entry["std_error"]
+        achieved, expected = std_errors.get(entry["name"]), entry["std_error"]
         ratio = achieved / expected if achieved is not None and expected else None
         entry |= {"achieved_std_error": achieved, "ratio": ratio}
-        ratios += [ratio] if ratio is not None else []
     for joint, entry in content["noise"].items():
         entry["achieved"] = result["identification"]["per_joint"].get(joint, {}).get("rmse")
+    ratios = [entry["ratio"] for entry in content["base_parameters"] if entry["ratio"] is not None]
     low, middle, high = np.quantile(ratios or [1.0], [0.1, 0.5, 0.9]).tolist()
     content["achieved"] = {"count": len(ratios), "median": middle, "range_80": [low, high]}
     return content
@@ -116,10 +114,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     if options.given:
         refuse_log_flags(options, "a RESULT states how its logs are read")
-    noise = pairs(options.noise, "--noise")
-    content = preview_job(
-        job_from_flags(options), options.given, noise=noise, correlation=options.correlation
-    )
+    job, noise = job_from_flags(options), pairs(options.noise, "--noise")
+    content = preview_job(job, options.given, noise=noise, correlation=options.correlation)
     show_found(content, options, partial(_show, is_verbose=options.verbose))
 
 
@@ -128,9 +124,9 @@ def _show(content: dict[str, Any], *, is_verbose: bool) -> None:
     count = f"{content['structure']['base']} base parameters, by {content['estimator']}"
     echo(f"{content['robot']}: {', '.join(motions)}; {count}", "  ")
     echo("\nbase parameters: expected standard errors, and their share of the plausible spread")
-    keys = {"std_error_before": "before", "gain": "gain", "achieved_std_error": "achieved",
-            "ratio": "ratio"}  # fmt: skip
-    keys = {key: head for key, head in keys.items() if key in content["base_parameters"][0]}
+    heads = {"std_error_before": "before", "gain": "gain", "achieved_std_error": "achieved",
+             "ratio": "ratio"}  # fmt: skip
+    keys = {key: head for key, head in heads.items() if key in content["base_parameters"][0]}
     rows = []
     for entry in content["base_parameters"]:
         error, more = entry["std_error"], len(_TERM.findall(entry["expression"]))
@@ -145,22 +141,18 @@ def _show(content: dict[str, Any], *, is_verbose: bool) -> None:
     counts = [f"{sources.count(source)} {source}" for source in dict.fromkeys(sources)]
     echo(f"\nstandard parameters, given the URDF: by {listed(counts)}", "  ")
     if is_verbose:
-        rows = [
-            [e["name"], f"{e['prior']:.4g}", _two_digits(e["std_error"]), e["unit"], e["source"]]
-            for e in parameters
-        ]
+        rows = [[e["name"], f"{e['prior']:.4g}", _two_digits(e["std_error"]), e["unit"],
+                 e["source"]] for e in parameters]  # fmt: skip
         print("\n".join(columns(["", "prior", "+-", "", "by"], rows, left=(0, 3, 4))))
     else:
         echo("each standard parameter, and the terms of each base parameter: --verbose")
     _print_expected_torque(content)
     echo(f"\n{content['words']}", "  ")
-    if "achieved" in content:
-        achieved = content["achieved"]
+    if achieved := content.get("achieved"):
+        low, high = achieved["range_80"]
         echo(
             f"\nthese logs were identified: of {achieved['count']} achieved standard errors, 80 % "
-            "are {:.2f} to {:.2f} times the expected ones; median {:.2f}".format(
-                *achieved["range_80"], achieved["median"]
-            )
+            f"are {low:.2f} to {high:.2f} times the expected ones; median {achieved['median']:.2f}"
         )
 
 
@@ -171,13 +163,13 @@ def _print_expected_torque(content: Mapping[str, Any]) -> None:
         "that the uncertainty of the parameters causes"
     )
     rows, noises = [], content["noise"].values()
-    found = ["achieved"] if all("achieved" in noise for noise in noises) else []
+    further = ["achieved"] if all("achieved" in noise for noise in noises) else []
     for (joint, torque), noise in zip(content["torque"].items(), noises, strict=True):
         cells = [f"{torque[key]:.3g}" for key in ("rms", "half_width", "of_parameters")]
-        achieved = [_two_digits(noise[key]) for key in found]
+        achieved = [_two_digits(noise[key]) for key in further]
         rows.append([joint, *cells, _two_digits(noise["std"]), *achieved, torque["unit"],
                      f"{noise['correlation']:.2g} s", noise["is"]])  # fmt: skip
-    heads = ["joint", "torque", "band", "part", "noise", *found, "", "over", ""]
+    heads = ["joint", "torque", "band", "part", "noise", *further, "", "over", ""]
     print("\n".join(columns(heads, rows, left=(0, len(heads) - 3, len(heads) - 1))))
     if any(noise["is"] == "assumed" for noise in noises):
         echo(

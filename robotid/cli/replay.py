@@ -29,8 +29,8 @@ from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource
 from robotid.design.clearance import Clearance
 from robotid.design.limits import LIMITS, Course, MotionLimits
-from robotid.dynamics.prediction import predict, predict_instants
 from robotid.dynamics.prepared_logs import closed_log
+from robotid.dynamics.torque import predict, predict_instants
 from robotid.estimation.fitting.recorded import hold_log
 from robotid.identification.result import TorqueIdentification
 from robotid.output.files.result_file import (
@@ -60,11 +60,12 @@ class Findings:
     folder: Path = Path()  # of the track.json and its history
     beside: Path = Path()  # folder of the first file
 
-    @property
-    def settings(self) -> Mapping[str, Any] | None:
-        """The settings of the first of them, None if there is none."""
+    def job(self, urdf: str | Path, log: str | Path) -> Job:
+        """Return the job of the first of them, with another URDF and log."""
         contents = [*(result.content for result in self.results.values()), self.track]
-        return next((content["settings"] for content in contents if content), None)
+        settings = next(content["settings"] for content in contents if content)
+        job = written_job(settings, "settings of the result")
+        return replace(job, urdf=Path(urdf), identification=(LogEntry(Path(log)),), validation=())
 
 
 def read_findings(paths: Sequence[str | Path]) -> Findings:
@@ -93,15 +94,6 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
         raise DataError(f"{len(tracks)} tracks are given, wanted at most one")
     folder, track = tracks[0] if tracks else (Path(), None)
     return Findings(results, track, folder, (beside or [Path()])[0])
-
-
-def stated_job(findings: Findings, urdf: str | Path, log: str | Path) -> Job:
-    """Return the job of the shown results, with another URDF and log."""
-    settings = findings.settings
-    if settings is None:
-        raise SettingsError("no result is given, wanted one for its settings")
-    job = written_job(settings, "settings of the result")
-    return replace(job, urdf=Path(urdf), identification=(LogEntry(Path(log)),), validation=())
 
 
 def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = None) -> Replay:
@@ -160,12 +152,10 @@ def replay_identified(identification: TorqueIdentification) -> Replay:
     predicted["URDF"] = shown.torques["urdf"]
     sigma = identification.estimate.sigma[model.n_rows - len(model.joints) :]
     torques = _of_joints(Torques(motion.t, motion.tau, predicted, sigma), model)
-    return replay(
-        model, motion.t, motion.q, torques=torques,
-        masses={"URDF": identification.prior, "identified": identification.standard},
-        notes=[f"Motion: {shown.recording.name}.", *([_PROJECTED] if model.constraints else [])],
-        log=Path(shown.recording.log.path).name,
-    )  # fmt: skip
+    masses = {"URDF": identification.prior, "identified": identification.standard}
+    notes = [f"Motion: {shown.recording.name}.", *([_PROJECTED] if model.constraints else [])]
+    log = Path(shown.recording.log.path).name
+    return replay(model, motion.t, motion.q, torques=torques, masses=masses, notes=notes, log=log)
 
 
 def _replay_commanded(job: Job, results: Mapping[str, Result], ghost: str | Path | None) -> Replay:
@@ -183,17 +173,15 @@ def _replay_commanded(job: Job, results: Mapping[str, Result], ghost: str | Path
     if ghost is not None:
         other = job.read(LogEntry(Path(ghost)), model, needs="motion")
         ghosts[Path(ghost).name] = (other.t, other.q + zero)
-    error = np.sqrt(np.mean((q_ref - log.q) ** 2, axis=0))
-    left = np.sqrt(np.nanmean((shown[names[0]] - log.q) ** 2, axis=0))
-    worst = [f"{model.joints[j]} {1e3 * left[j]:.2g}" for j in np.argsort(-left).tolist()]
+    lag = np.sqrt(np.mean((q_ref - log.q) ** 2, axis=0))
+    error = np.sqrt(np.nanmean((shown[names[0]] - log.q) ** 2, axis=0))
+    worst = [f"{model.joints[j]} {1e3 * error[j]:.2g}" for j in np.argsort(-error).tolist()]
     notes = [
         f"Motion: {entry.path.name}, as measured; ghosts: command and simulation.",
         f"Simulated position error, RMS [mrad or mm]: {listed(worst, 3)}.",
     ]
-    torques = Torques(log.t, log.q, shown, error, "position")
-    return replay(
-        model, log.t, log.q + zero, torques=torques, ghosts=ghosts, notes=notes, log=entry.path.name
-    )
+    torques, q, name = Torques(log.t, log.q, shown, lag, "position"), log.q + zero, entry.path.name
+    return replay(model, log.t, q, torques=torques, ghosts=ghosts, notes=notes, log=name)
 
 
 def _base_poses(job: Job, entry: LogEntry, log: Log) -> Array | None:
@@ -210,9 +198,8 @@ def _base_poses(job: Job, entry: LogEntry, log: Log) -> Array | None:
     try:
         pose = BaseMotion(pose[known]).pose  # with continuous signs
     except DataError as error:
-        raise DataError(
-            f"{entry.path.name}: {error}; remove these columns for a fixed base"
-        ) from error
+        remedy = "remove these columns for a fixed base"
+        raise DataError(f"{entry.path.name}: {error}; {remedy}") from error
     t = columns[time[0]][known]
     at = np.column_stack([np.interp(log.t, t, column) for column in pose.T])
     at[:, 3:] /= np.linalg.norm(at[:, 3:], axis=1, keepdims=True)
@@ -228,27 +215,24 @@ def _noise(findings: Findings, model: RobotModel) -> Array | None:
 
 
 def _torques(
-    job: Job,
-    log: Log,
-    model: RobotModel,
-    robots: Mapping[str, RobotModel],
+    job: Job, log: Log, model: RobotModel, robots: Mapping[str, RobotModel],
     results: Mapping[str, Result],
-) -> Torques:
+) -> Torques:  # fmt: skip
     """Return measured torques, and those predicted by each result and by the URDF."""
-    shown, driven, motion = dict[str, Array](), dict[str, Array](), None
+    torques, driven, motion = dict[str, Array](), dict[str, Array](), None
     for label, robot in robots.items():
         rows = hold_log(robot, log, job.signals).whole
-        motion = rows.trajectory
-        is_driven = not driven and robot.layout.drive_names
-        beside = stated_urdf_with_drives(results[label].content, robot) if is_driven else None
-        own = [robot.carried_by] if beside is None else [robot.carried_by, beside]
-        predicted = [_of_moving(torque, rows.mask) for torque in predict(robot, own, motion)]
-        shown[label] = predicted[0]
+        motion, pi = rows.trajectory, [robot.carried_by]
+        if not driven and robot.layout.drive_names:
+            beside = stated_urdf_with_drives(results[label].content, robot)
+            pi += [] if beside is None else [beside]
+        predicted = [_of_moving(torque, rows.mask) for torque in predict(robot, pi, motion)]
+        torques[label] = predicted[0]
         driven |= dict(zip([_DRIVEN], predicted[1:], strict=False))
     if motion is None:
         return Torques(log.t, log.tau)
     alone = {"URDF": predict(model, [model.standard_parameters()], motion)[0]}
-    return _of_joints(Torques(motion.t, motion.tau, shown | driven | alone), model)
+    return _of_joints(Torques(motion.t, motion.tau, torques | driven | alone), model)
 
 
 def _of_joints(torques: Torques, model: RobotModel) -> Torques:
@@ -265,26 +249,20 @@ def _of_moving(torque: Array, mask: Array) -> Array:
 
 def _bands(track: Mapping[str, Any], folder: Path) -> Bands:
     table = open_table(folder / track["history"], LogSource())
-    entries = track["base_parameters"]
-    names = [entry["name"] for entry in entries]
+    names, units = zip(*((x["name"], x["unit"]) for x in track["base_parameters"]), strict=True)
     errors = [f"{name}.std_error" for name in names]
     wanted = ["time", *names, *errors]
-    missing = [name for name in wanted if name not in table.names]
-    if missing:
+    if missing := [name for name in wanted if name not in table.names]:
         raise DataError(f"{track['history']} has no column {missing[0]!r}; run robotid track again")
     columns = table.read(wanted)
     theta, std_error = (np.column_stack([columns[x] for x in some]) for some in (names, errors))
-    units = [entry["unit"] for entry in entries]
-    return Bands(t=columns["time"], names=names, units=units, theta=theta, std_error=std_error)
+    return Bands(columns["time"], list(names), list(units), theta, std_error)
 
 
 def _payloads(track: Mapping[str, Any] | None) -> list[Mark]:
-    marks = []
-    for change in [] if track is None else track["changes"]:
-        load = change["payload"]
-        label = f"payload {load['mass']:.2f} ± {load['std_error']:.2f} kg on {load['body']}"
-        marks.append(Mark(change["onset"], label, "payload"))
-    return marks
+    words = "payload {mass:.2f} ± {std_error:.2f} kg on {body}"
+    changes = [] if track is None else track["changes"]
+    return [Mark(x["onset"], words.format(**x["payload"]), "payload") for x in changes]
 
 
 def _limits_used(job: Job, motion: Log, model: RobotModel) -> tuple[list[Mark], list[str]]:
@@ -305,11 +283,10 @@ def _limits_used(job: Job, motion: Log, model: RobotModel) -> tuple[list[Mark], 
             label = f"{name} at {100 * used[joint]:.0f} % of its {kind} limit"
             marks.append(Mark(course.peak(kind, joint), label, "note", name))
     try:
-        course = replace(course, clearance=Clearance(model))
+        near = replace(course, clearance=Clearance(model)).nearest
     except DataError as error:
         return marks, [*notes, f"Collisions are not checked: {error}."]
-    if course.nearest is not None:
-        near = course.nearest
+    if near is not None:
         gap = f"smallest distance {1e3 * near.distance:.0f} mm"
         text = gap if near.distance > 0 else "convex hulls overlap"
         marks.append(Mark(near.time, f"{near.first} and {near.second}: {text}"))
@@ -330,11 +307,11 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     findings = read_findings(options.results)
-    if findings.settings is None:
-        job = job_from_flags(options)
-    else:
+    if options.results:
         refuse_log_flags(options, "a RESULT states how its logs are read")
-        job = stated_job(findings, options.source, options.logs[0])
+        job = findings.job(options.source, options.logs[0])
+    else:
+        job = job_from_flags(options)
     page_file = Path(options.html or findings.beside / "replay.html")
     check_file(page_file, [options.source, *options.logs, *options.results])
     target = replay_files(job, findings, ghost=options.ghost).write(page_file)

@@ -2,7 +2,6 @@
 
 import argparse
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from robotid.base.files import check_file, file_sha256, write_json
 from robotid.base.findings import listed
 from robotid.base.typing import Array, ProgressCallback, ignore_progress
 from robotid.base.versions import __version__
-from robotid.cli.console import echo, print_files, progress_of, show_found
+from robotid.cli.console import echo, progress_of, show_found
 from robotid.cli.job import (
     JOB,
     ROBOT,
@@ -31,8 +30,14 @@ from robotid.data.signals import process
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.motions import SampledMotion
 from robotid.dynamics.simulation.simulation_settings import Simulation, read_simulation
-from robotid.dynamics.simulation.simulator import Run, carried, delay, follow, measure
-from robotid.dynamics.simulation.truth import draw_parameters
+from robotid.dynamics.simulation.simulator import (
+    Run,
+    carried,
+    delay,
+    draw_parameters,
+    follow,
+    measure,
+)
 from robotid.output.files.result_file import SCHEMA_VERSION
 from robotid.output.files.urdf import write_urdf
 from robotid.robot.model import RobotModel
@@ -95,12 +100,9 @@ def simulate(
         "motion": {"path": str(motion), "sha256": file_sha256(motion)},
         "outputs": [str(path) for path in (log, truth, urdf) if path],
     }
-    if urdf:  # an impossible URDF is refused before any file is written
-        with TemporaryDirectory(prefix="robotid-") as folder:
-            write_urdf(model, pi, Path(folder, Path(urdf).name), dynamics=True)
-    write_log(measured, target)
-    if urdf:
+    if urdf:  # first: an impossible URDF is refused before any file is written
         write_urdf(model, pi, urdf, dynamics=True)
+    write_log(measured, target)
     write_json(content | {"log_sha256": file_sha256(target)}, truth)
     return content
 
@@ -108,11 +110,10 @@ def simulate(
 def _motion(job: Job, model: RobotModel, path: Path, cutoff: float | None) -> SampledMotion:
     """Return the motion of a table, filtered if it was recorded."""
     table = job.read(LogEntry(path), model, needs="motion")
-    smooth = None
-    if cutoff is not None:
-        smooth = process(table, SignalSettings(cutoff=cutoff, velocity="differentiated", trim=0.0))
-    course = smooth or table
-    return SampledMotion(course.t, course.q, course.v, course.a)
+    if cutoff is None:
+        return SampledMotion(table.t, table.q, table.v, table.a)
+    smooth = process(table, SignalSettings(cutoff=cutoff, velocity="differentiated", trim=0.0))
+    return SampledMotion(smooth.t, smooth.q, smooth.v, smooth.a)
 
 
 def _truth(
@@ -128,39 +129,27 @@ def _truth(
 
     prior = model.standard_parameters()[:size]
     error = run.q - run.reference
+    bodies = _rows(name=layout.names[:size], value=pi[:size], unit=layout.units[:size], urdf=prior)
+    drives = _rows(name=layout.names[size:], value=pi[size:], unit=layout.units[size:])
+    following = _rows(
+        joint=model.joints,
+        rms=np.sqrt(np.mean(error**2, axis=0)), largest=np.abs(error).max(axis=0),
+        range=np.ptp(run.q, axis=0), commanded=np.ptp(run.reference, axis=0),
+        unit=["m" if joint in layout.prismatic else "rad" for joint in model.joints],
+        at_limit=run.saturated,
+    )  # fmt: skip
     content: dict[str, Any] = {
-        "schema_version": SCHEMA_VERSION,
-        "robotid": __version__,
-        "robot": model.name,
-        "joints": list(model.joints),
-        "settings": settings.to_dict(),
-        "model": model.options,
-        "samples": len(log.t),
-        "duration": float(run.t[-1]),
-        "standard_parameters": _rows(
-            name=layout.names[:size], value=pi[:size], unit=layout.units[:size], urdf=prior
-        ),
-        "drive_parameters": _rows(
-            name=layout.names[size:], value=pi[size:], unit=layout.units[size:]
-        ),
-        "base_parameters": base(pi),
-        "following": _rows(
-            joint=model.joints,
-            rms=np.sqrt(np.mean(error**2, axis=0)),
-            largest=np.abs(error).max(axis=0),
-            range=np.ptp(run.q, axis=0),
-            commanded=np.ptp(run.reference, axis=0),
-            unit=["m" if joint in layout.prismatic else "rad" for joint in model.joints],
-            at_limit=run.saturated,
-        ),
-    }
+        "schema_version": SCHEMA_VERSION, "robotid": __version__, "robot": model.name,
+        "joints": list(model.joints), "settings": settings.to_dict(), "model": model.options,
+        "samples": len(log.t), "duration": float(run.t[-1]), "standard_parameters": bodies,
+        "drive_parameters": drives, "base_parameters": base(pi), "following": following,
+    }  # fmt: skip
     if settings.payload.mass > 0:
         content["base_parameters_with_payload"] = base(carried(model, pi, settings.payload))
     return content
 
 
 def _rows(**columns: Any) -> list[dict[str, Any]]:  # noqa: ANN401
-    """Return the rows of a table of lists and arrays."""
     plain = [x.tolist() if isinstance(x, np.ndarray) else x for x in columns.values()]
     return [dict(zip(columns, row, strict=True)) for row in zip(*plain, strict=True)]
 
@@ -204,13 +193,10 @@ def run(options: argparse.Namespace) -> None:
             job, options.motion, options.out, settings,
             urdf=options.urdf, cutoff=options.cutoff, progress=progress,
         )  # fmt: skip
-    show_found(content, options, _show)
-    if not options.json:
-        print_files("", content["outputs"])
+    show_found(content, options, _show, content["outputs"])
 
 
-def simulation_from_flags(options: argparse.Namespace) -> "tuple[Job, Simulation]":
-    """Return the robot and the settings of a simulation."""
+def simulation_from_flags(options: argparse.Namespace) -> tuple[Job, Simulation]:
     settings, drives = read_simulation(options.plant, _PLANT.stated(options))
     for joint, entries in drives.items():
         if named := [entry for entry in entries if isinstance(entry, str)]:

@@ -21,11 +21,9 @@ from robotid.output.files.result_file import SCHEMA_VERSION
 
 def run_track(job: Job, folder: str | Path) -> dict[str, Any]:
     """Track the one log of a job, write the history and track.json, and return its content."""
-    model = job.model()
+    model, target, (entry,) = job.model(), Path(folder), job.identification
     history = "track.parquet" if find_spec("pyarrow") else "track.csv"
-    inputs = [job.urdf, *(entry.path for entry in job.identification)]
-    check_folder(Path(folder), [history, "track.json"], inputs)
-    (entry,) = job.identification
+    check_folder(target, [history, "track.json"], [job.urdf, entry.path])
     log = job.read(entry, model)
     if job.signals.cutoff is None:
         raise SettingsError(
@@ -33,12 +31,10 @@ def run_track(job: Job, folder: str | Path) -> dict[str, Any]:
             "cutoff in Hz"
         )
     rate = job.signals.rate or 1.0 / float(np.median(np.diff(log.t)))
-    settings = OnlineSettings(
-        rate=rate, cutoff=job.signals.cutoff, min_velocity=job.signals.min_velocity
-    )
+    cutoff, slowest = job.signals.cutoff, job.signals.min_velocity
+    settings = OnlineSettings(rate=rate, cutoff=cutoff, min_velocity=slowest)
     tracked = track(model, log, settings)
     content = _summary(tracked, job, log, history)
-    target = Path(folder)
     target.mkdir(parents=True, exist_ok=True)
     with folder_beside(target) as partial:
         write_columns(tracked.columns(), partial / history)
@@ -55,14 +51,11 @@ def _summary(tracked: Track, job: Job, log: Log, history: str) -> dict[str, Any]
     rows = zip(mapping.base_names, mapping.expressions, last.theta.tolist(),
                last.std_error.tolist(), units, strict=True)  # fmt: skip
     keys = ("name", "expression", "value", "std_error", "unit")
-    inputs = {"urdf": str(job.urdf), "log": log.path}
+    inputs = [("urdf", str(job.urdf)), ("log", log.path)]
     return {
         "schema_version": SCHEMA_VERSION, "robotid": __version__, "robot": model.name,
         "joints": list(model.joints), "settings": job.to_dict(),
-        "inputs": [
-            {"role": role, "path": path, "sha256": file_sha256(path)}
-            for role, path in inputs.items()
-        ],
+        "inputs": [{"role": x, "path": path, "sha256": file_sha256(path)} for x, path in inputs],
         "samples": len(log.t), "delay": identifier.delay, "first_estimate": float(tracked.t[0]),
         "converged_at": converged[0] if converged else None, "excitation": last.excitation,
         "sigma": dict(zip(model.row_names, last.sigma.tolist(), strict=True)),
@@ -90,7 +83,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     content = run_track(job_from_flags(options), options.out)
-    show_found(content, options, _show, [content["history"], "track.json"])
+    show_found(content, options, _show, [content["history"], "track.json"], options.out)
 
 
 def _show(found: dict[str, Any]) -> None:
@@ -103,11 +96,9 @@ def _show(found: dict[str, Any]) -> None:
     for change in found["changes"]:
         load = change["payload"]
         mass, error = in_digits_of(load["mass"], load["std_error"])
-        echo(
-            f"step change at {change['onset']:.2f} s, detected at {change['flagged']:.2f} s; "
-            f"equivalent payload on {load['body']}: {mass} +- {error} kg",
-            "  ",
-        )
+        when = f"at {change['onset']:.2f} s, detected at {change['flagged']:.2f} s"
+        payload = f"equivalent payload on {load['body']}: {mass} +- {error} kg"
+        echo(f"step change {when}; {payload}", "  ")
     rows = []
     for entry in found["base_parameters"]:
         value, error = in_digits_of(entry["value"], entry["std_error"])

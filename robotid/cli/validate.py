@@ -78,20 +78,17 @@ def compare_runs(
             f"variation.sums in {result.path.name} does not fit the robot ({error}): another "
             "version of robotid wrote it; identify again from all logs"
         ) from error
-    names = [Path(log.path).name for log in logs]
+    names, count = [Path(log.path).name for log in logs], len(stated["logs"])
     units = [log.unit or any(before["unit"]) * name for log, name in zip(logs, names, strict=True)]
     unit_names, unit = np.unique([*before["unit"], *units], return_inverse=True)
     groups = runs_of(model, mapping, pi, sums, unit)
     varied = vary([*stated["logs"], *names], groups, unit_names.tolist())
     assert varied is not None
-    count = len(stated["logs"])
-    unlike = replace(
-        varied,
-        unlike=tuple(run for run in varied.unlike if run.run >= count),
-        unlike_units=tuple(run for run in varied.unlike_units if run.run in unit[count:]),
-    )
+    unlike = tuple(run for run in varied.unlike if run.run >= count)
+    unlike_units = tuple(run for run in varied.unlike_units if run.run in unit[count:])
+    findings = unlike_findings(replace(varied, unlike=unlike, unlike_units=unlike_units))
     added = [source_entry(log.path) for log in logs]
-    return varied.to_dict() | {"added": added}, tuple(unlike_findings(unlike))
+    return varied.to_dict() | {"added": added}, tuple(findings)
 
 
 def validate(result: str | Path, logs: Sequence[LogEntry | str | Path]) -> dict[str, Any]:
@@ -126,8 +123,8 @@ def validate(result: str | Path, logs: Sequence[LogEntry | str | Path]) -> dict[
     (surveyed,) = survey_logs(job, model, entries)
     driven = stated_urdf_with_drives(content, source)
     _, evaluations = evaluate_logs((), surveyed, {"estimate": pi}, prior, driven)
-    own = [log.with_model(source) for log in surveyed]
-    variation, unlike = compare_runs(loaded, source, own, job.estimator)
+    runs = [log.with_model(source) for log in surveyed]
+    variation, unlike = compare_runs(loaded, source, runs, job.estimator)
     verdict = _verdict(job, source, content, evaluations, surveyed, unlike)
     return {
         "result": str(result),
@@ -154,17 +151,12 @@ def _expected(
     motion = recording.trajectory
     band = torque_band(model, mapping, motion, mapping.K @ C @ mapping.K.T, noise)
     inside = band.coverage(motion.tau, evaluation.torques["estimate"], recording.mask)
-    rows = zip(model.row_names, rms_error([band]), inside, strict=True)
-    return {
-        "expected": {
-            "with_spread": between is not None,
-            "per_joint": {
-                row: {"rmse": float(error), "within_95_pct": finite(100.0 * share)}
-                for row, error, share in rows
-                if row in of_fit
-            },
-        }
+    per_joint = {
+        row: {"rmse": float(error), "within_95_pct": finite(100.0 * share)}
+        for row, error, share in zip(model.row_names, rms_error([band]), inside, strict=True)
+        if row in of_fit
     }
+    return {"expected": {"with_spread": between is not None, "per_joint": per_joint}}
 
 
 def _validate_commands(loaded: Result, job: Job, entries: Sequence[LogEntry]) -> dict[str, Any]:
@@ -188,34 +180,29 @@ def _validate_commands(loaded: Result, job: Job, entries: Sequence[LogEntry]) ->
 
 
 def _verdict(
-    job: Job,
-    model: RobotModel,
-    result: Mapping[str, Any],
-    evaluations: Sequence[Evaluation],
-    logs: Sequence[SurveyedLog],
-    unlike: Sequence[Finding],
-) -> Verdict:
+    job: Job, model: RobotModel, result: Mapping[str, Any], evaluations: Sequence[Evaluation],
+    logs: Sequence[SurveyedLog], unlike: Sequence[Finding],
+) -> Verdict:  # fmt: skip
     """Return the verdict on logs, which may be fitted, faulty, unlike, or of a fitted motion."""
     hashes, is_robust = fitted_hashes(result), job.estimator.is_robust
     is_there = [log_exists(e.path) and file_sha256(e.path) in hashes for e in job.identification]
     (surveyed,) = survey_logs(job, model, list(compress(job.identification, is_there)))
     fitted = [look for log in surveyed for look in log.looks]
-    again = [  # whether a log is a fitted one, or a cut or thinned copy
-        file_sha256(log.path) in hashes
-        or any(shares_rows(a, b) or shares_rows(b, a) for a in log.looks for b in fitted)
+    is_new = [  # whether a log is neither a fitted one nor a cut or thinned copy
+        file_sha256(log.path) not in hashes
+        and not any(shares_rows(a, b) or shares_rows(b, a) for a in log.looks for b in fitted)
         for log in logs
     ]
-    is_new = [not is_refitted for is_refitted in again]
     looks = [look for log in compress(logs, is_new) for look in log.looks]
     names = list(dict.fromkeys(Path(log.path).name for log in looks))
     of_doctor = diagnose(model, fitted, looks, job.signals)
-    found = [*(x for x in of_doctor if x.where.split(": ")[0] in names), *unlike]
-    found = [finding for finding in found if finding.code not in job.ignore]
-    log_errors = [x.message for x in blocking(found, job.ignore, is_robust=is_robust)]
-    stated = result["verdict"]
+    findings = [*(x for x in of_doctor if x.where.split(": ")[0] in names), *unlike]
+    findings = [finding for finding in findings if finding.code not in job.ignore]
+    log_errors = [x.message for x in blocking(findings, job.ignore, is_robust=is_robust)]
+    stated, structure = result["verdict"], result["structure"]
     warnings = [VerdictWarning(**warning) for warning in stated.get("warnings", ())]
     warnings = [warning for warning in warnings if warning.code != "repeated_motion"]
-    warnings += warnings_of(found, model.joints, names, is_robust=is_robust)
+    warnings += warnings_of(findings, model.joints, names, is_robust=is_robust)
     if not all(is_there):
         missing = [e.path.name for e in compress(job.identification, np.logical_not(is_there))]
         message = (
@@ -223,13 +210,11 @@ def _verdict(
             "recordings were not compared with fitted rows"
         )
         warnings.append(VerdictWarning("fitted_logs_missing", "", message))
-    structure = result["structure"]
+    new = {e.recording.name: e.metrics["estimate"] for e in compress(evaluations, is_new)}
     return judge(
         Predictions(
-            Metrics({}, 0.0),
-            {e.recording.name: e.metrics["estimate"] for e in compress(evaluations, is_new)},
-            tuple(joint for joint in model.joints if joint not in model.passive),
-            refitted=[e.recording.name for e in compress(evaluations, again)],
+            Metrics({}, 0.0), new, tuple(x for x in model.joints if x not in model.passive),
+            refitted=[e.recording.name for e in compress(evaluations, np.logical_not(is_new))],
             hidden=hidden_joints(model, evaluations),
         ),
         Determined(
@@ -262,17 +247,15 @@ def _show(found: dict[str, Any]) -> None:
     for recording in found["validation"]:
         echo(f"\n{recording['name']}", "  ")
         print("\n".join(error_lines(recording, width=terminal_width())))
-        expected = recording.get("expected", {})
-        if expected:
-            source = "fit, for logs of the same day"
-            if expected["with_spread"]:
-                source = "fit and spread between logs"
+        if expected := recording.get("expected"):
+            has_spread = expected["with_spread"]
+            source = " and spread between logs" if has_spread else ", for logs of the same day"
             figures = ", ".join(
                 f"{joint} {error['rmse']:.3g} ({error['within_95_pct']:.0f} %)"
                 for joint, error in expected["per_joint"].items()
                 if error["within_95_pct"] is not None
             )
-            echo(f"expected rmse by the {source} (share of rows within 95 %): {figures}", "  ")
+            echo(f"expected rmse by the fit{source} (share of rows within 95 %): {figures}", "  ")
     for finding in found.get("findings", ()):
         echo(f"\n{finding['message']}")
     print_verdict(found["verdict"])

@@ -33,13 +33,17 @@ from robotid.data.signals import low_pass
 from robotid.diagnosis.logs.check_logs import excitation_finding
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.factors import Factors, compress, join, merge
-from robotid.dynamics.prediction import predict, predict_instants
 from robotid.dynamics.prepared_logs import base_problem, independent_share
+from robotid.dynamics.torque import predict, predict_instants
 from robotid.estimation.estimators import Estimate
 from robotid.estimation.estimators.batch import solve_factor
 from robotid.estimation.estimators.determination import base_spread, determine
 from robotid.estimation.estimators.estimator import FEWEST_SEGMENTS, scatter
-from robotid.estimation.fitting.estimator_settings import ConsistentSettings, EstimatorSettings
+from robotid.estimation.fitting.estimator_settings import (
+    ConsistentSettings,
+    EstimatorSettings,
+    OLSSettings,
+)
 from robotid.estimation.fitting.evaluation import evaluate_logs
 from robotid.estimation.fitting.fit import Known, consistent_fit, pinned_links
 from robotid.estimation.fitting.fitted import expected_band
@@ -486,7 +490,7 @@ def _errors(
         for sigma in (information.sigma, np.ones_like(information.sigma))
     )
     if not isinstance(choice, ConsistentSettings):
-        return (alike if choice.has_equal_weights else plain), plain
+        return (alike if isinstance(choice, OLSSettings) else plain), plain
     stated = choice.prior_weight
     weight, plausible = typical if isinstance(stated, str) else (stated, 1.0)
     bounds = {**choice.constraints, "extent": "none"}

@@ -1,11 +1,9 @@
 """Decisions: how options are selected on held-out segments, and the thresholds of this package.
 
-Options compete to explain a residual. Each is fitted together with those selected before, with one
-segment of the recordings held out after the other, and compared by the squared residual of the
-held-out segments. An option is selected if it reduces it significantly and by enough; of options
-that explain about the same the simplest is selected. Then the others compete again, until none
-improves the fit. The caller decides what follows: a term is added, reported or left undecided.
-Each group of thresholds names the benchmark that measures its correct and false detections.
+Options compete to explain a residual, each fitted together with those selected before, by the
+squared residual of segments that are held out in turn. One is selected if it reduces it
+significantly and by enough, the simplest of those that explain about the same; then the others
+compete again. Groups of thresholds name the benchmark of their correct and false detections.
 """
 
 from collections.abc import Callable, Hashable, Iterator, Mapping
@@ -40,8 +38,7 @@ SIMULATED_FAMILY = Rule(most=3, share=0.02, p_value=None, alike=0.0)
 FAMILY_LEAST = 0.006
 #: p-value below which a family that is not selected is undecided: it widens intervals.
 UNDECIDED_P_VALUE = 0.25
-#: Factor on the standard error of another parameter above which terms are reported.
-TENFOLD = 10.0
+TENFOLD = 10.0  # Factor on the standard error of another parameter above which terms are reported
 #: Distance from a bound, of the logarithm of its range, within which a shape is at the bound.
 AT_BOUND = 0.02
 #: Share of the squared residual that a missing term, a recording or URDF that differs, or a
@@ -49,14 +46,12 @@ AT_BOUND = 0.02
 LEAST_SHARE, P_VALUE = 0.1, 3e-4
 # Terms that a drive model lacks: benchmarks/bench_misfit.py
 MISFIT = Rule(most=3, share=LEAST_SHARE, p_value=P_VALUE)
-#: Share of the squared residual above which a term is a warning.
-MISFIT_WARNS = 0.25
+MISFIT_WARNS = 0.25  # Share of the squared residual above which a term is a warning
 #: Size over the torque above which a term is reported, and above which it is a warning.
 MISFIT_REPORTED, MISFIT_MATTERS = 0.005, 0.02
 #: Share above which a coupling is reported although the other joint does not confirm it.
 ONE_SIDED = 0.6
-#: Part of the share that validation logs must confirm, if there are any.
-CONFIRMED = 0.25
+CONFIRMED = 0.25  # Part of the share that validation logs must confirm, if there are any
 #: [%] of the squared residual: a term that explains more replaces a hypothesis of the doctor.
 MAIN = 50.0
 #: Factor on a standard error above which a parameter is reported as affected by a misfit.
@@ -67,22 +62,15 @@ ALTERATION = Rule(most=3, share=-float("inf"), p_value=None)
 #: A smaller share is also reported if validation logs confirm it fully, its p-value is tiny and its
 #: size is twice the one that changes a result: it biases masses even if noise hides it.
 WEAK, WEAK_P_VALUE, WEAK_SIZE = 0.03, 1e-5, 2.0
-#: Standard errors that its size must differ from 0.
-SIGNIFICANT = 5.0
+SIGNIFICANT = 5.0  # Standard errors that its size must differ from 0
 # Segments that are held out in turn, and their samples.
 SEGMENTS, SHORTEST = 16, 10  # most segments, and fewest independent samples of one
-#: Smallest number of segments for a test.
-FEWEST = 6
-#: Typical residuals above which a sample is excluded.
-OUTLIER = 12.0
-#: Standard errors, or deviations, beyond which a value is no noise.
-BEYOND_NOISE = 3.0
-#: Share of the rows from which a fault of single rows is reported.
-SHARE_OF_ROWS = 0.02
-#: Instants of a motion that are used: more are not independent after the filter.
-ROWS = 2000
-#: Relative size below which a quantity counts as 0.
-TINY = 1e-6
+FEWEST = 6  # Smallest number of segments for a test
+OUTLIER = 12.0  # Typical residuals above which a sample is excluded
+BEYOND_NOISE = 3.0  # Standard errors, or deviations, beyond which a value is no noise
+SHARE_OF_ROWS = 0.02  # Share of the rows from which a fault of single rows is reported
+ROWS = 2000  # Instants of a motion that are used: more are not independent after the filter
+TINY = 1e-6  # Relative size below which a quantity counts as 0
 #: Share of a column below which it is rounding, and relative step of a derivative by a shape.
 ROUNDING, STEP = 1e-10, 1e-3
 #: Size of the correlation from which two parameters or signals are strongly correlated: if one were
@@ -94,10 +82,8 @@ AGREES = 0.05
 DIFFERS = 2 * AGREES
 #: Factor beyond which a torque or a total mass is no error of the URDF's masses.
 NO_ERROR_OF_MASSES = 3.0
-#: Segments from which a scatter is determined.
-SCATTERED = 3
-#: A sum of squares that is 0, as a divisor.
-NOTHING = 1e-300
+SCATTERED = 3  # Segments from which a scatter is determined
+NOTHING = 1e-300  # A sum of squares that is 0, as a divisor
 Option = TypeVar("Option", bound=Hashable)
 
 

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import termios
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,8 @@ from helpers.paths import ROOT
 
 from robotid.base.findings import Finding
 from robotid.base.typing import STAGES
-from robotid.cli import doctor, main
+from robotid.cli import compare, doctor, main, paper, payload
+from robotid.cli.console import progress_of, recordings_of
 
 ARM = str(ROOT / "urdf" / "planar_2r.urdf")
 
@@ -76,6 +78,10 @@ def test_a_result_names_recordings_with_their_windows_and_commands_that_work(arm
     _, fit, keep = result["inputs"]
     assert f"\nfitted: fit.csv {fit['start']:.4g}-{fit['end']:.4g} s\n" in said
     assert f"\nnot fitted: keep.csv {keep['start']:.4g}-{keep['end']:.4g} s\n" in said
+    before, after, _ = result["scale_check"]["masses"]
+    assert f"total mass {before:.2f} -> {after:.2f} kg" in said.replace("\n", " ")
+    errors = [x["relative_error_pct"] for x in result["validation"][0]["per_joint"].values()]
+    assert re.search(rf"worst: joint_\d, torque error {max(errors):.1f} %", said.replace("\n", " "))
     notes = sum(warning["severity"] == "note" for warning in result["warnings"])
     assert notes
     flat = " ".join(said.split())
@@ -100,6 +106,9 @@ def test_inspect_says_what_it_found_first_and_a_missing_file_once(tmp_path, caps
     printed = capsys.readouterr()
     missing = f"robotid: there is no URDF file '{tmp_path / 'none.urdf'}'\n"
     assert (printed.out, printed.err) == ("", missing)
+    assert main(["inspect", ARM, "--free-flyer"]) == 0
+    printed = capsys.readouterr().out
+    assert printed.endswith(f"\n  robotid inspect {shlex.quote(ARM)} --free-flyer --base\n")
     urdf = tmp_path / "two.urdf"
     urdf.write_text(Path(ARM).read_text().replace('value="1.9"', 'value="-1.9"'))
     assert main(["inspect", str(urdf)]) == 1
@@ -142,6 +151,53 @@ def test_findings_are_told_by_cause_and_the_worst_joint_is_named(capsys):
     wrong.append(finding("arm_7", "five", 9, "error"))
     doctor._show(wrong, joints, {}, is_verbose=False, count=2)
     assert capsys.readouterr().out.splitlines()[-1].endswith("worst: arm_6"), "two errors"
+
+
+def test_a_stage_is_printed_once_and_files_of_one_name_with_their_folders(capsys):
+    with progress_of(SimpleNamespace(verbose=True)) as show:
+        for what, done, unit in (
+            ("fitting", 2, "stages"),
+            ("pieces", 0, "pieces"),
+            ("fitting", 2, "stages"),
+        ):
+            show(what, done, 5, unit)
+    assert capsys.readouterr().err == "robotid: 3/5 fitting\n"
+    paths = ["a/run.csv", "b/run.csv", "a/run.csv", "c/one.csv", ""]
+    logs = [{"path": x, "role": "fit", "start": k, "end": k + 2} for k, x in enumerate(paths)]
+    assert recordings_of([*logs, {"path": "c/one.csv", "role": "other"}], "fit") == [
+        "a/run.csv 0-2 s", "b/run.csv 1-3 s", "a/run.csv 2-4 s", "one.csv 3-5 s", "log 4-6 s",
+    ]  # fmt: skip
+
+
+def test_the_paper_and_base_parameters_are_printed_in_columns(capsys):
+    model = {"relative_error": [0.5, 0.25, 0.125], "NA": 7}
+    cases = {case: {"linear": {"relative_error": [1.0, 0.1 * k]}}
+             for k, case in enumerate(("disturbed", "noisy", "on_program"), 1)}  # fmt: skip
+    runs = {"linear": {"converged": 3, "runs": 4}}
+    paper._show({"models": {"linear": model}, "trajectories": runs, **cases})
+    _, _, row, *_, last = capsys.readouterr().out.splitlines()
+    assert row.split() == ["linear", "0.5", "0.25", "0.12", "0.1", "0.2", "0.3", "7"]
+    assert last.split() == ["linear", "3", "of", "4"]
+    entries = [
+        {"name": f"p{k}", "values": [1.0, k], "std_errors": [0.1, 0.01], "unit": "kg",
+         "differences": [k]} for k in range(4)
+    ]  # fmt: skip
+    for limit, shown in ((2, 2), (3, 4), (None, 4)):
+        compare._print_base_parameters({"base_parameters": entries}, ["A", "B"], limit)
+        printed = capsys.readouterr().out
+        assert printed.count(" kg ") == shown
+        assert ("  2 more with smaller differences: --verbose" in printed) == (limit == 2)
+    assert "\n  p3  1.00  3.000  kg  3.0\n" in printed
+    inertia, errors = np.array([[[1.0, 2.0, 3.0], [2.0, 4.0, 5.0], [3.0, 5.0, 6.0]]] * 2)
+    errors = 0.1 * errors
+    load = {"link": "tool", "mass": 2.0, "mass_std_error": 0.01, "mass_interval": [1.98, 2.02],
+            "com": None, "inertia": inertia, "inertia_std_error": errors, "reasons": {},
+            "inertia_at_link": 10 * inertia}  # fmt: skip
+    payload._print_one_payload(load, None)
+    printed = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["Ixy", "2.00", "+-", "0.20"] in printed
+    assert ["Iyz", "5.00", "+-", "0.50"] in printed
+    assert ["Iyz", "50"] in printed
 
 
 CLOSED = {"no output": ">&-", "no errors": "2>&-", "neither": ">&- 2>&-"}

@@ -51,6 +51,18 @@ def test_a_motion_is_designed_written_and_told(designed):
     assert content["feasible"] is True
 
 
+def test_the_page_of_a_motion_states_the_errors_that_a_preview_of_it_expects(designed, capsys):
+    *_, page = designed
+    words = ["preview", WORDS[1], str(page.with_suffix(".parquet")), *WORDS[2:4], "--json"]
+    assert main(words) == 0
+    entries = json.loads(capsys.readouterr().out)["base_parameters"]
+    shares = np.array([entry["std_error"] / entry["plausible"] for entry in entries])
+    assert (
+        f"Of {len(shares)} base parameters, {(shares < 0.1).sum()} have an expected standard error "
+        f"below 10 % of their plausible range, {(shares > 0.5).sum()} above 50 %."
+    ) in page.read_text()
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -69,6 +81,7 @@ def test_a_motion_is_designed_written_and_told(designed):
         (["--max-jerk", "wrist_1_joint=1e300"], "jerk of 'wrist_1_joint' is 1e+300, wanted"),
         (["--box", "post=0,0,0,1,1,nan"], "the lower and the upper corner [m], within 1000 m"),
         (["--criterion", "widest"], "criterion is widest, which needs an earlier result"),
+        (["--kind", "sweeps", "--max-jerk", "wrist_1_joint=1"], "% of its jerk limit at "),
     ],
 )
 def test_bad_flags_are_refused_before_anything_is_written(tmp_path, capsys, words, message):
@@ -192,7 +205,8 @@ def test_every_flag_states_its_setting():
 def stated_by_flags(*words):
     parser = argparse.ArgumentParser()
     excite.add_flags(parser)
-    return excite.motion_settings(parser.parse_args(["arm.urdf", "--out", "m.csv", *words]))
+    options = parser.parse_args(["arm.urdf", "--out", "m.csv", *words])
+    return MotionSettings.from_dict(excite.MOTION.stated(options))
 
 
 def test_a_floating_base_and_a_robot_with_contacts_are_refused(tmp_path, capsys):

@@ -1,20 +1,32 @@
-"""Flags state what the keys of a job file state."""
+"""Flags state what the keys of a job file state; help, schema and completions know them."""
 
 import argparse
+import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
+import jsonschema
 import pytest
 
 from robotid.base.exceptions import SettingsError
-from robotid.cli import CommandParser, doctor, identify, preview, track
+from robotid.cli import CommandParser, doctor, excite, identify, main, preview, track
 from robotid.cli.job import job_from_flags, job_from_settings, source_words
+from robotid.cli.schema import job_schema
 from robotid.data.signal_settings import LogSource, SignalSettings
+
+LOG = {"log": "run.csv"}
+
+
+def parsed(command, *words):
+    parser = argparse.ArgumentParser()
+    command.add_flags(parser)
+    return parser.parse_args(words)
 
 
 def job(command, *words):
-    parser = argparse.ArgumentParser()
-    command.add_flags(parser)
-    return job_from_flags(parser.parse_args(["robot.urdf", "run.csv", *words]))
+    return job_from_flags(parsed(command, "robot.urdf", "run.csv", *words))
 
 
 def test_every_setting_of_the_signals_has_a_flag():
@@ -99,12 +111,19 @@ def test_gains_are_stated_for_all_joints_or_by_joint():
             job(identify, *fit, *words)
 
 
+def test_a_job_file_takes_neither_logs_nor_flags_beside_it():
+    for words, given in (
+        (["run.csv"], "run.csv"),
+        (["--cutoff", "5", "--validate", "b.csv"], "--validate, --cutoff"),
+    ):
+        with pytest.raises(SettingsError, match=f"settings. Remove {given}, and state them in"):
+            job_from_flags(parsed(identify, "job.toml", *words))
+
+
 @pytest.mark.parametrize(("command", "wanted"), [(identify, "URDF LOG"), (preview, "URDF MOT")])
 def test_a_command_without_a_log_names_what_it_wants(command, wanted):
-    parser = argparse.ArgumentParser()
-    command.add_flags(parser)
     with pytest.raises(SettingsError, match=f"no .* is given; wanted {wanted}"):
-        job_from_flags(parser.parse_args(["robot.urdf"]))
+        job_from_flags(parsed(command, "robot.urdf"))
 
 
 def test_a_flag_is_stated_once_and_validation_logs_add_up(capsys):
@@ -120,3 +139,100 @@ def test_a_flag_is_stated_once_and_validation_logs_add_up(capsys):
                 ["r.urdf", "a.csv", flag, "6" if value == "5" else value, flag, value]
             )
         assert f"argument {flag}: stated twice, as " in capsys.readouterr().err
+
+
+def printed(capsys, *words):
+    """Return the exit code and the text of a command line that ends in its parser."""
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    found = capsys.readouterr()
+    return ended.value.code, found.out + found.err
+
+
+@pytest.mark.parametrize(
+    ("words", "near"),
+    [
+        (
+            ["identify", "r.urdf", "l.csv", "--vaildate", "b.csv", "--x"],
+            "unknown; did you mean --va",
+        ),
+        (["inspect", "r.urdf", "x"], "'x' is one word too many; a flag takes one word"),
+        (["replay", "r.urdf", "l.csv", "--xyz=3"], "--xyz is unknown; see 'robotid replay --help'"),
+        (["identfy", "robot.urdf"], "argument COMMAND: 'identfy' is unknown; did you mean 'ident"),
+        (["export", "r.json", "--format", "mjfc", "--out", "x"], "'mjfc' is unknown; did you mean"),
+        (["excite", "r.urdf", "--out", "x", "--kind", "furier"], "did you mean 'fourier'? Known: "),
+    ],
+)
+def test_a_misspelt_word_is_answered_with_the_nearest_one(capsys, words, near):
+    code, said = printed(capsys, *words)
+    assert code == 2
+    assert near in said
+
+
+@pytest.mark.parametrize("module", [identify, excite], ids=["identify", "excite"])
+def test_the_help_of_large_commands_is_short_and_has_two_examples(capsys, monkeypatch, module):
+    monkeypatch.setenv("COLUMNS", "80")
+    name = module.__name__.rpartition(".")[2]
+    code, short = printed(capsys, name, "--help")
+    assert code == 0
+    assert len(short.splitlines()) <= 40
+    assert max(map(len, short.splitlines())) <= 80
+    assert short.count(f"  robotid {name} ") == 2
+    assert all(f"  {flag} " in short for flag in module.MAIN_FLAGS)
+    assert "--help-all" in short
+    code, whole = printed(capsys, name, "--help-all")
+    assert code == 0
+    assert len(whole.splitlines()) > 60
+    assert "--snap-angles" in whole
+    assert "--snap-angles" not in short
+
+
+@pytest.fixture(scope="module")
+def check():
+    schema = job_schema()
+    jsonschema.Draft202012Validator.check_schema(schema)
+    return jsonschema.Draft202012Validator(schema).validate
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"joint": ["a"]},
+        {"joints": "a"},
+        {"gravity": [0.0, -9.81]},
+        {"gravity": [0.0, 0.0, -9.81, 0.0]},
+        {"locked": {"a": "here"}},
+        {"signals": {"velocity": "guessed"}},
+        {"signals": {"rate": "fast"}},
+        {"estimator": {"name": "magic"}},
+        {"estimator": {"prior_weight": "heavy"}},
+        {"estimator": {"constraints": {"masses": {}}}},
+        {"identification": [{"start": 1.0}]},
+        {"validation": LOG},
+        {"coupling": [{"name": "motor"}]},
+        {"reduction": {"workers": 2.5}},
+    ],
+    ids=lambda wrong: json.dumps(wrong),
+)
+def test_what_a_job_refuses_is_invalid(check, wrong):
+    job = {"urdf": "robot.urdf", "identification": [LOG]}
+    check(job)
+    job_from_settings(job, "job.toml", Path())
+    with pytest.raises(jsonschema.ValidationError):
+        check(job | wrong)
+    with pytest.raises(SettingsError):
+        job_from_settings(job | wrong, "job.toml", Path())
+
+
+def test_a_shell_is_told_what_may_follow(tmp_path):
+    answers = {}
+    for line in ("robotid exc", "robotid export result --format s"):
+        asked = {
+            "_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "COMP_LINE": line,
+            "COMP_POINT": str(len(line)), "_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "words"),
+        }  # fmt: skip
+        words = [sys.executable, "-m", "robotid"]
+        done = subprocess.run(words, env=os.environ | asked, capture_output=True, timeout=60)
+        assert done.returncode == 0
+        answers[line] = (tmp_path / "words").read_text().split()
+    assert list(answers.values()) == [["excite"], ["sdf"]]

@@ -13,7 +13,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import DataError
 from robotid.cli import fleet, main
-from robotid.cli.fleet import read_fleet, run_fleet
+from robotid.cli.fleet import FleetUnit, read_fleet, run_fleet
 from robotid.data.files.read import write_log
 from robotid.estimation.variation.variation import between_units
 from robotid.estimation.work_plan import WorkPlan
@@ -107,22 +107,35 @@ def test_units_with_the_same_inputs_are_kept_and_new_logs_added(table, done, tmp
         assert (tmp_path / "own" / name).read_bytes() == (done[0] / name).read_bytes()
     repeated.clear()
     extra = replace(units[2], logs=(*units[2].logs, units[1].logs[0]))
-    changed = [
-        units[1],
-        extra,
-        replace(units[1], unit="loaded", logs=((units[1].logs[0][0], 2.0),)),
-    ]
-    found = run_fleet(changed, tmp_path / "own", plan=WorkPlan(), resume=True)
-    assert repeated == ["c", "loaded"]
-    assert found["logs"] == 4
-    run_fleet(changed, tmp_path / "whole", plan=WorkPlan())
+    changed = run_fleet([units[1], extra], tmp_path / "own", plan=WorkPlan(), resume=True)
+    assert repeated == ["c"]
+    assert changed["logs"] == 3
+    run_fleet([units[1], extra], tmp_path / "whole", plan=WorkPlan())
     for name in FILES:
-        own = (tmp_path / "own" / name).read_bytes()
-        assert own == (tmp_path / "whole" / name).read_bytes()
-    repeated.clear()
+        assert (tmp_path / "own" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_a_unit_is_identified_again_if_an_input_changes(table, tmp_path, monkeypatch):
+    repeated, robot, job = [], tmp_path / "robot.urdf", tmp_path / "job.toml"
+    robot.write_text(URDF.read_text())
+    job.write_text('urdf = "robot.urdf"\n')
+    log, other = (table.parent / name for name in ("b0.csv", "c0.csv"))
+    unit = FleetUnit("u", ((log, None), (other, 1.0)), robot, job)
+
+    def is_repeated(unit):
+        repeated.clear()
+        run_fleet([unit], tmp_path / "out", plan=WorkPlan(), resume=True)
+        return bool(repeated)
+
+    rows = [{"unit": "u", "status": "done"}]
+    monkeypatch.setattr(fleet, "identify_unit", lambda unit, _: repeated.append(unit) or rows)
+    assert [is_repeated(unit), is_repeated(unit)] == [True, False]
+    assert is_repeated(replace(unit, logs=((log, None), (other, 2.0))))
+    for file in (robot, job):
+        file.write_text(f"{file.read_text()}\n")
+        assert [is_repeated(unit), is_repeated(unit)] == [True, False]
     monkeypatch.setattr(fleet, "code_versions", lambda: {"numpy": "0.1"})
-    run_fleet(units[1:2], tmp_path / "own", plan=WorkPlan(), resume=True)
-    assert repeated == ["b"]
+    assert is_repeated(unit)
 
 
 def test_rows_state_urdf_job_and_payload(tmp_path):

@@ -9,6 +9,7 @@ import pytest
 from robotid.base.exceptions import SettingsError
 from robotid.cli.job import Job, LogEntry
 from robotid.cli.logs import locked_as_logged, survey_logs, units_of_logs
+from robotid.data.signal_settings import Transmission
 from robotid.robot.drives import DRIVE_TERMS
 
 HAND = """<robot name="hand"><link name="base"/><link name="a"/><link name="b"/><link name="c"/>
@@ -54,8 +55,18 @@ def test_a_joint_is_locked_at_the_median_of_all_logs_if_it_stands_there_in_each(
     assert job.locked == {"jc": pytest.approx(0.3001)}
     leader = replace(hand, locked={"jc": 0.0})  # the position of jd follows from it
     assert leader.placed(leader.model()) == ("jc", "jd")
-    stated = replace(hand, locked={"jc": 0.0, "jd": 0.2})
-    assert locked_as_logged(stated, stated.model(), [first], [second])[-1] == ()
+    for locked in ({"jc": 0.0, "jd": 0.2}, {"*": 0.1}):
+        stated = replace(hand, locked=locked)
+        assert locked_as_logged(stated, stated.model(), [first], [second])[-1] == ()
+
+
+def test_a_motor_that_moves_two_joints_replaces_the_drive_of_the_joint(hand):
+    gear = Transmission(("ja", "slide"), ((32.0, 0.0), (45.0, 90.0)), ("m", "n"))
+    model = replace(hand, transmissions=(gear,)).model()
+    (coupling,) = model.layout.couplings
+    assert coupling.replaces
+    assert (coupling.name, coupling.ratios) == next(iter(gear.shared.items()))
+    assert {joint for joint, _ in coupling.ratios} == {"ja", "slide"}
 
 
 @pytest.mark.parametrize(("dynamics", "is_whole"), [("full", False), ("static", True)])

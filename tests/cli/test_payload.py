@@ -84,7 +84,7 @@ def test_a_job_states_a_check_of_the_scale_which_its_result_has(files):
         "urdf": ARM, "identification": [{"log": "bare.csv"}],
         "model": {"friction": "viscous+coulomb"}, "output": {"report": False},
         "payload_check": [
-            {"log": "loaded.csv", "mass": 1.8, "link": "tool0", "end": 3.0},
+            {"log": "loaded.csv", "mass": 1.8, "end": 3.0},
             {"log": "loaded.csv", "mass": 1.8, "link": "tool0"},
         ],
     }  # fmt: skip
@@ -92,7 +92,7 @@ def test_a_job_states_a_check_of_the_scale_which_its_result_has(files):
     check, other = found.scale_check.payloads  # the narrower interval first: the whole log
     widths = [high - low for low, high in (check.interval, other.interval)]
     assert widths[0] < widths[1]
-    assert (check.known, check.link) == (1.8, "tool0")
+    assert (check.known, check.link, other.link) == (1.8, "tool0", "wrist_3_link")
     assert check.identified == pytest.approx(2.0, abs=0.06)
     assert check.interval[0] < 2.0 < check.interval[1]
     assert check.sha256 == file_sha256(files / "loaded.csv")

@@ -1,6 +1,7 @@
 """`robotid preview`: from positions to what they will tell, and to what they told."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -83,8 +84,12 @@ def test_a_run_before_says_what_gains_most(files, capsys):
         assert factor <= before[name] / after[name] * 1.001
     assert max(gain.values()) > 1.3
     text = asked(capsys, *words)
-    assert "before" in text
-    assert "gain" in text
+    head, *rows = text.partition("spread\n")[2].splitlines()
+    assert head.split() == ["+-", "left", "before", "gain"]
+    for row, entry in zip(rows, content["base_parameters"], strict=False):
+        left = 100 * min(entry["std_error"] / entry["plausible"], 1)
+        figures = (f"{entry[key]:.2g}" for key in ("std_error_before", "gain"))
+        assert re.split(r" {2,}", row)[-3:] == [f"{left:.0f} %", *figures]
     assert "assumed" not in text
 
 

@@ -19,6 +19,8 @@ from robotid.cli import main
 from robotid.cli.replay import _of_joints, replay_identified
 from robotid.data.files.read import open_table, write_columns, write_log
 from robotid.data.signal_settings import LogSource
+from robotid.identification.online import OnlineSettings
+from robotid.identification.online import track as tracked
 from robotid.output.files.result_file import load_result
 from robotid.output.viewer.replays import Torques
 from robotid.robot.examples import example_urdf
@@ -71,10 +73,13 @@ def test_a_log_alone_plays_with_its_torques(folder, capsys):
 
 def test_a_result_predicts_and_shows_masses_before_and_after(folder):
     _, data = run(folder, folder / "log.csv", folder / "out")
+    result = json.loads((folder / "out" / "result.json").read_text())
+    stated = result["identification"]["per_joint"]
     assert data["torques"]["labels"] == ["measured", "identified", "URDF + drives", "URDF"]
+    noise = [metrics["rmse"] for metrics in stated.values()]
+    np.testing.assert_allclose(data["torques"]["scale"]["of"], noise, rtol=1e-6)
     measured, predicted, driven, _ = np.split(data["torques"]["values"], 4, axis=1)
     assert np.array_equal(np.isnan(driven), np.isnan(predicted))
-    stated = json.loads((folder / "out" / "result.json").read_text())["identification"]["per_joint"]
     for j, metrics in enumerate(stated.values()):
         used = np.isfinite(driven[:, j])
         error = np.linalg.norm((measured - driven)[used, j]) / np.linalg.norm(measured[used, j])
@@ -85,12 +90,11 @@ def test_a_result_predicts_and_shows_masses_before_and_after(folder):
     # the motion is exact and the fit explains it, but for what the filter takes
     residual = (predicted - measured)[known]
     assert np.linalg.norm(residual) < 0.01 * np.linalg.norm(measured[known])
-    result = json.loads((folder / "out" / "result.json").read_text())
-    stated = {entry["name"]: entry["value"] for entry in result["standard_parameters"]}
+    value = {entry["name"]: entry["value"] for entry in result["standard_parameters"]}
     before, after = data["masses"]
     assert (before["label"], after["label"]) == ("URDF", "identified")
     for body in after["bodies"]:
-        assert body["mass"] == pytest.approx(stated[f"{body['name']}.m"])
+        assert body["mass"] == pytest.approx(value[f"{body['name']}.m"])
 
 
 def test_the_urdf_with_drives_is_rnea_and_drive_terms(identified, monkeypatch):
@@ -139,12 +143,20 @@ def test_a_track_gives_parameters_over_time_and_marks_the_load(panda, tmp_path, 
     np.testing.assert_allclose(data["bands"]["values"][-1], wanted, rtol=1e-6)
 
 
-def test_a_track_has_converged_at_the_first_of_its_rows_that_say_so(tmp_path):
+def test_a_track_has_converged_at_the_first_of_its_rows_that_say_so(tmp_path, capsys):
     urdf, out = ROOT / "urdf" / "planar_2r.urdf", tmp_path / "track"
     arm, rng = RobotModel.from_urdf(urdf), np.random.default_rng(0)
-    write_log(exact_log(arm, truth(arm), rng, samples=1500, noise=1.0), tmp_path / "log.csv")
-    assert main(["track", str(urdf), str(tmp_path / "log.csv"), "--out", str(out)]) == 0
+    log = exact_log(arm, truth(arm), rng, samples=1500, noise=1.0)
+    write_log(log, tmp_path / "log.csv")
+    words = ["--cutoff", "6", "--rate", "80", "--min-velocity", "0.3", "--out", str(out)]
+    assert main(["track", str(urdf), str(tmp_path / "log.csv"), *words]) == 0
     track = json.loads((out / "track.json").read_text())
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"1500 samples, delay of the estimate {1e3 * track['delay']:.0f} ms, conv" in said
+    settings = OnlineSettings(rate=80.0, cutoff=6.0, min_velocity=0.3)
+    same = tracked(arm, log, settings).identifier.reading.theta
+    values = [entry["value"] for entry in track["base_parameters"]]
+    np.testing.assert_allclose(values, same, rtol=1e-6)
     history = open_table(out / track["history"], LogSource()).read(["time", "converged"])
     first, *later = history["time"][history["converged"] > 0]
     assert track["converged_at"] == first > history["time"][0]
@@ -228,7 +240,8 @@ def test_a_motion_without_torques_plays_and_marks_where_it_uses_the_most_of_limi
     assert speed[round(100 * marks["velocity"]["t"])] == pytest.approx(speed.max(), abs=1e-6)
     assert marks["torque"]["joint"] == "shoulder_lift_joint"  # which carries the arm
     (nearest,) = (mark for mark in data["marks"] if "smallest distance" in mark["label"])
-    assert re.fullmatch(r"\w+ and \w+: smallest distance \d+ mm", nearest["label"])
+    found = re.fullmatch(r"\w+ and \w+: smallest distance (\d+) mm", nearest["label"])
+    assert 1 < int(found[1]) < 50
     assert data["notes"][1].startswith("The motion has no torques")
 
 

@@ -166,7 +166,7 @@ def test_a_robot_that_cannot_be_a_urdf_leaves_no_file(folder, capsys):
     assert not list(folder.glob("never*"))
 
 
-def test_a_limit_and_a_load_do_what_they_say_and_the_truth_states_it(arm, tmp_path):
+def test_a_limit_and_a_load_do_what_they_say_and_the_truth_states_it(arm, tmp_path, capsys):
     """A load at the origin of the last link: by hand, three times its mass in the columns."""
     write_motion(tmp_path / "motion.csv", arm, 3, duration=4.0)
     words = ["--controller", "pd", "--rate", "100", "--seed", "3", "--duration", "3"]
@@ -183,7 +183,10 @@ def test_a_limit_and_a_load_do_what_they_say_and_the_truth_states_it(arm, tmp_pa
     q_ref = SampledMotion(*motion_of(tmp_path / "motion.csv", arm)).evaluate(log.t)[0]
     error = np.abs(log.q - q_ref)
     assert ((log.q - q_ref).max(axis=0) < error.max(axis=0)).any()  # the largest is a lag
+    said = capsys.readouterr().out
     for j, entry in enumerate(truth["following"]):
+        is_slow = entry["range"] < 0.5 * entry["commanded"]
+        assert (f"warning: {arm.joints[j]} moves {entry['range']:.2g}" in said) == is_slow
         assert entry["joint"] == arm.joints[j]
         assert entry["unit"] == "rad"
         assert entry["rms"] == pytest.approx(np.sqrt(np.mean(error[:, j] ** 2)), rel=1e-6)
@@ -197,6 +200,20 @@ def test_a_limit_and_a_load_do_what_they_say_and_the_truth_states_it(arm, tmp_pa
         for key in ("base_parameters", "base_parameters_with_payload")
     )
     np.testing.assert_allclose(loaded - bare, mapping.to_base(load), atol=1e-9)
+
+
+def test_the_torque_of_a_drive_with_a_lag_is_logged_later(arm, tmp_path):
+    write_motion(tmp_path / "motion.csv", arm, 3, duration=2.0)
+    files = [arm.tree.path, str(tmp_path / "motion.csv"), "--out", str(tmp_path / "log.csv")]
+    plant, torques = tmp_path / "plant.toml", []
+    for lag in (0.0, 0.02):  # [s], of 200 Hz
+        values = f'[truth]\nvalues = {{ "joint_2.lag" = {lag} }}\n'
+        plant.write_text(f'{values}[drives]\njoint_2 = [{{ term = "Lag" }}]\n')
+        words = ["--plant", str(plant), "--rate", "200", "--controller", "pd"]
+        assert main(["simulate", *files, *words]) == 0
+        torques.append(read_log(tmp_path / "log.csv", arm.joints).tau)
+    np.testing.assert_array_equal(torques[1][:, 0], torques[0][:, 0])
+    np.testing.assert_allclose(torques[1][4:, 1], torques[0][:-4, 1], atol=1e-9)
 
 
 def motion_of(path, model):

@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.base.findings import Finding
 from robotid.cli.identify import run_job
-from robotid.cli.job import job_from_settings
+from robotid.cli.job import Job, job_from_settings
+from robotid.cli.logs import result_run
 from robotid.cli.validate import validate
 from robotid.data.files.read import write_log
 
@@ -60,6 +62,13 @@ def test_another_motion_is_a_prediction(here):
     folder, _, other = here
     found = verdict(folder, other)
     assert found["status"] == "good", found["reasons"]
+
+
+def test_the_weights_of_the_prior_of_a_result_are_those_of_its_logs(arm, here):
+    path = here[0] / "out" / "result.json"
+    prior = json.loads(path.read_text())["consistency"]["fit"]["prior"]
+    *_, run = result_run(Job(Path(arm.tree.path)), path)
+    assert run.weight == (1.0, prior["plausible_weight"])
 
 
 def test_figures_of_the_fitted_log_are_those_of_the_result(here):

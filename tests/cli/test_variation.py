@@ -131,7 +131,7 @@ def written(result, folder, tmp_path, monkeypatch):
     for file in (folder / "out").glob("*.*"):
         if file.suffix in (".urdf", ".json"):
             shutil.copy(file, tmp_path)
-    write_log(changed_log(found, 11, elbow_joint__coulomb=1.1), tmp_path / "more_0.csv")
+    write_log(changed_log(found, 11, elbow_joint__coulomb=3.0), tmp_path / "more_0.csv")
     write_log(changed_log(found, 12, shoulder_lift_joint__coulomb=0.9), tmp_path / "more_1.csv")
     return tmp_path
 
@@ -164,9 +164,12 @@ def test_new_logs_are_compared_with_the_fitted_ones_without_reading_these(result
     before, hidden = file.read_bytes(), folder / "hidden"
     (folder / "run_2.csv").rename(hidden)
     try:
-        variation = validate(file, new)["variation"]
+        done = validate(file, new)
     finally:
         hidden.rename(folder / "run_2.csv")
+    variation = done["variation"]
+    unlike = {(x["where"].split(":")[0], x["code"]) for x in done["findings"]}
+    assert unlike == {("more_0.csv", "unlike_run")}
     assert variation["logs"] == [f"run_{k}.csv" for k in range(4)] + ["more_0.csv", "more_1.csv"]
     for name, entry in wanted["parameters"].items():
         own = variation["parameters"][name]

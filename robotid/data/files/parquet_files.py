@@ -18,15 +18,7 @@ from robotid.base.files import DATASET, missing_file, read_json
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.data.files.columns import named_by_row
-from robotid.data.files.table import (
-    Format,
-    Place,
-    RowReader,
-    Table,
-    choose,
-    load_package,
-    parsing,
-)
+from robotid.data.files.table import Format, Place, RowReader, Table, choose, load_package, parsing
 from robotid.data.log import repeated, suggestion
 from robotid.data.signal_settings import LogSource
 

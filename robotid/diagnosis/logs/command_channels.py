@@ -54,12 +54,12 @@ def check_commands(log: Log, prismatic: Collection[str] = ()) -> Iterator[Findin
     yield from _shown(log, moved)
     yield from _held(log, moved)
     yield from _alike(log, moved)
-    early = []
-    for loop in moved:  # a joint that moves before its command
-        lag, error = loop.lag
-        if lag < -max(SIGNIFICANT * error, loop.step):
-            words = {"lag": lag, "lead": -lag, "std_error": error}
-            early.append(finding("delayed_command", log.name, loop.name, **words))
+    early = [  # a joint that moves before its command
+        finding("delayed_command", log.name, loop.name, lag=lag, lead=-lag, std_error=error)
+        for loop in moved
+        for lag, error in [loop.lag]
+        if lag < -max(SIGNIFICANT * error, loop.step)
+    ]
     clipped = dict(_saturated(log, moved))
     small = list(_small(log, [loop for loop in moved if loop.name not in clipped]))
     yield from (*early, *clipped.values(), *small)
@@ -108,8 +108,7 @@ class _Loop:
     @property
     def command(self) -> Array:
         """Commanded positions, shape (N,)."""
-        assert self.log.q_ref is not None
-        return np.asarray(self.log.q_ref[self.rows, self.joint])
+        return np.asarray(self.log.q_ref)[self.rows, self.joint]
 
     @property
     def is_commanded(self) -> bool:
@@ -273,20 +272,20 @@ def _alike(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
 
 def _slow(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     """Yield the joints whose command is too slow to distinguish a delay from damping."""
-    names, ranges = list[str](), list[tuple[float, float]]()
-    fastest = 0.0
+    slow = []
     for loop in loops:
-        (f, _, _), (least, most), lag = loop.response, loop.delays, loop.lag[0]
-        width = most - least
-        is_determined = width <= _DETERMINED and (most < lag - 1e-3 or lag < _DETERMINED)
+        (least, most), lag = loop.delays, loop.lag[0]
+        is_narrow = most - least <= _DETERMINED
+        is_determined = is_narrow and (most < lag - 1e-3 or lag < _DETERMINED)
         if np.isnan(loop.bandwidth) and not is_determined:
-            names, ranges = [*names, loop.name], [*ranges, (least, most)]
-            fastest = max(fastest, float(f.max(initial=0.0)))
+            slow.append(loop)
+    fastest = max((float(loop.response[0].max(initial=0.0)) for loop in slow), default=0.0)
     if fastest > 0.0:
-        least, most = min(low for low, _ in ranges), max(high for _, high in ranges)
+        names = [loop.name for loop in slow]
+        shortest, longest = zip(*(loop.delays for loop in slow), strict=True)
         yield finding(
             "slow_command", log.name, _named(log, names), joint=listed(names),
-            frequency=fastest, shortest=least, longest=most,
+            frequency=fastest, shortest=min(shortest), longest=max(longest),
         )  # fmt: skip
 
 
@@ -298,12 +297,11 @@ def _small(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
         share = float(np.median(followed / swept)) if len(swept) >= _SWEEPS else 1.0
         evidence = {"sweep": sweep, "followed": share, "step": step}
         if share < (_FOLLOWED if loop.lag[0] > 0 else _STUCK):
-            dead = float(np.median(swept - followed))
+            what, dead = "suppressed", float(np.median(swept - followed))
             evidence |= {"sweep": float(np.median(swept)), "dead": dead, "wanted": 5 * dead}
-            what = "suppressed"
         elif sweep < _RESOLVED * step:
-            evidence |= {"count": sweep / step, "wanted": 5 * _RESOLVED * step}
             what = "steps"
+            evidence |= {"count": sweep / step, "wanted": 5 * _RESOLVED * step}
         else:
             continue
         yield finding("small_command", log.name, loop.name, what=what, unit=loop.unit, **evidence)
@@ -338,8 +336,8 @@ def _sampled(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     """Yield the joints whose log rate is too low for the bandwidth of their loops."""
     widths = {}
     for loop in loops:
-        f = loop.response[0]
-        width = loop.bandwidth if np.isfinite(loop.bandwidth) else float(f[-1]) if len(f) else 0.0
+        highest = float(loop.response[0].max(initial=0.0))
+        width = loop.bandwidth if np.isfinite(loop.bandwidth) else highest
         if width * loop.step * _RESOLVED > 1:
             widths[loop.name] = width
     if widths:
@@ -357,9 +355,8 @@ def _disturbed(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
         since = round(_SETTLED / loop.step)
         changed = np.append(True, np.diff(loop.command) != 0)
         last = np.maximum.accumulate(np.where(changed, np.arange(len(changed)), 0))
-        runs = [run for run in runs_of(np.arange(len(last)) - last >= since)]
-        rows = np.concatenate([np.arange(i, k) for i, k in runs] or [np.empty(0, int)])
-        if len(rows) * loop.step < _CONSTANT:
+        runs = runs_of(np.arange(len(last)) - last >= since)
+        if sum(k - i for i, k in runs) * loop.step < _CONSTANT:
             continue
         centred = np.concatenate([q[i:k] - q[i:k].mean(axis=0) for i, k in runs])
         moved, others = centred[:, loop.joint], np.delete(centred, loop.joint, axis=1)

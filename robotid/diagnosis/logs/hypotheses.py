@@ -19,13 +19,11 @@ from robotid.diagnosis.logs.channels import AT_REST, ZERO
 from robotid.dynamics.rows import drive_values, friction_directions, friction_speeds, inertial_rows
 from robotid.robot.model import GRAVITY, RobotModel
 
-#: Decrease of the misfit from which another gravity is reported.
-HINT = 0.7
+HINT = 0.7  # Decrease of the misfit from which another gravity is reported
 #: Ratio of unexplained shares from which another reading is certain; as decrease of the misfit.
 MUCH_BETTER = 12.0
 CERTAIN = float(np.log(MUCH_BETTER))
-#: An unexplained share below this is negligible.
-FLOOR = 1e-3
+FLOOR = 1e-3  # An unexplained share below this is negligible
 _MARGIN = 0.15  # [s] rows closer to the end of a segment are not used: the filter has not settled
 _SLOW = 0.05  # largest speed of the unknown sign of friction of a slow joint, over its largest
 _POOR = 0.08  # unexplained share from which other readings of the positions are tested
@@ -153,14 +151,10 @@ def take_probe(model: RobotModel, motion: Trajectory, *, samples: int = 500) -> 
 class Explanation:
     """A hypothesis on the log, and how well the torques are explained under it."""
 
-    #: "stated", "payload", "torque_sign", "unsigned_torque", "torque_order", "gravity",
-    #: "joint_order", "joint_axis", "position_order", "position_sign" or "position_offset"
-    kind: str
+    kind: str  # "stated", "payload", or the code of its finding
     share: Array  # (n,), unexplained share of each torque's variance
     joints: tuple[int, ...] = ()  # Indices of the joints concerned
-    #: "torque_order": the joint of each torque column; "gravity": the vector [m/s^2];
-    #: "position_offset": the offset [rad]
-    values: tuple[float, ...] = ()
+    values: tuple[float, ...] = ()  # joint of each torque column, gravity [m/s^2], or offset [rad]
 
     @property
     def misfit(self) -> float:
@@ -231,8 +225,7 @@ def _order(share: Array) -> Explanation:
 
     columns, joints = linear_sum_assignment(np.log(share[:, :, 0] + FLOOR))
     moved = tuple(np.flatnonzero(columns != joints).tolist())
-    values = tuple(joints.astype(float).tolist())
-    return Explanation("torque_order", share[columns, joints, 0], moved, values)
+    return Explanation("torque_order", share[columns, joints, 0], moved, tuple(joints.tolist()))
 
 
 def _gravity(probe: Probe, stated: Explanation) -> Explanation:

@@ -6,7 +6,6 @@ applied to torque and regressor, because a filter of only one of them looks like
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -101,17 +100,6 @@ def _at(delay: float, values: Array) -> Array:
     return np.asarray(values[..., k - 1] + share * (values[..., k] - values[..., k - 1]))
 
 
-@dataclass(frozen=True, eq=False)
-class _Window:
-    """Filtered torques at N instants of a motion, and the columns that may explain them."""
-
-    inertial: Array  # (N, columns), of the bodies that each joint carries, joint after joint
-    drive: Array  # (N, n, k), of each joint's inertia, frictions and position, of coupled drives
-    steady: Array  # (N, n), whether the drive is far from stiction
-    delayed: Array  # (N, delays, n), torques at each delay of the grid after the instants
-    load: Array  # (N, n), friction that grows with the URDF's torque, for a coefficient of 1
-
-
 def check_torque_delay(
     model: RobotModel, log: Log, signals: SignalSettings, name: str
 ) -> Iterator[Finding]:
@@ -158,12 +146,14 @@ def _misfit(
     ]
     if not parts:
         return None
-    window = _Window(*map(np.concatenate, zip(*parts, strict=True)))
-    ends = np.cumsum(model.support[:, : model.layout.n_inertial].sum(axis=1)).tolist()
-    columns = [slice(*pair) for pair in pairwise([0, *ends])]
-    squares = [_squares(window, j, own) for j, own in enumerate(columns)]
+    inertial, *others = map(np.concatenate, zip(*parts, strict=True))
+    ends = np.cumsum(model.support[:, : model.layout.n_inertial].sum(axis=1))[:-1]
+    squares = [
+        _squares(columns, *(x[:, j] for x in others))
+        for j, columns in enumerate(np.split(inertial, ends, axis=1))
+    ]
     used = [one for one in squares if one is not None]
-    if len(used) < max(2.0, len(columns) / 2):
+    if len(used) < max(2.0, len(squares) / 2):
         return None
     plain, loaded, rows = zip(*used, strict=True)
     return _Misfit(np.array(plain), np.array(loaded), np.array(rows, dtype=float))
@@ -214,8 +204,8 @@ def _window(
     slow = is_reversal | (np.abs(v) < _SLOW)
     steady = [distance(at, t[slow[:, j]]) > _AWAY * period for j in range(v.shape[1])]
     tau = low_pass(motion.tau[rows], 1 / step, signals)
-    delayed = _interpolated(t, tau, at + _GRID[:, None]).swapaxes(0, 1)
-    drive = np.concatenate([own, coupled], axis=2)
+    delayed = np.moveaxis(_interpolated(t, tau, at + _GRID[:, None]), 0, 2)  # (N, n, delays)
+    drive = np.concatenate([own, coupled], axis=2)  # (N, n, k)
     return inertial, drive, np.column_stack(steady), delayed, load
 
 
@@ -237,15 +227,16 @@ def _interpolated(t: Array, values: Array, times: Array) -> Array:
     return np.asarray(CubicSpline(t, values)(times))
 
 
-def _squares(window: _Window, j: int, own: slice) -> tuple[Array, Array, int] | None:
-    """Return the unexplained part of joint j's torque, and its instants."""
+def _squares(
+    inertial: Array, drive: Array, steady: Array, delayed: Array, load: Array
+) -> tuple[Array, Array, int] | None:
+    """Return the unexplained part of a joint's torque, and its instants."""
     # Shapes (blocks, delays), in the second friction grows with the load; None if it hardly moves.
-    at = window.steady[:, j]
-    used = int(np.count_nonzero(at))
-    if used < max(_FEW, MOVING * len(at)):
+    used = int(np.count_nonzero(steady))
+    if used < max(_FEW, MOVING * len(steady)):
         return None
-    inertial, drive, load = window.inertial[at, own], window.drive[at, j], window.load[at, j]
-    tau = np.ascontiguousarray(window.delayed[at, :, j].T)
+    inertial, drive, load = inertial[steady], drive[steady], load[steady]
+    tau = np.ascontiguousarray(delayed[steady].T)
     tau -= tau.mean(axis=1, keepdims=True)  # (delays, N)
     size = np.sum(tau**2, axis=1)
     if size.min() <= 0:

@@ -37,9 +37,7 @@ class Misfit:
 
     joint: str
     term: Candidate
-    #: Share of the joint's squared residual in held-out segments that it explains beyond the terms
-    #: found before it [-].
-    share: float
+    share: float  # of the joint's squared residual that it explains beyond those before it [-]
     p_value: float  # of that share [-]
     confirmed: float | None  # the same share on the validation logs; None without one
     size: float  # its parameter, or its RMS torque, see the units of the term
@@ -50,8 +48,7 @@ class Misfit:
     theta: Array  # (c,), parameters of its columns
     scale: JointMotion  # the motion that sets the scale of its columns
     entries: tuple[str | DriveTerm, ...] = ()  # of the joint in [drives] that add it
-    #: Change of the friction at the RMS speed per minute, and its standard error [N m/min or
-    #: N/min], of a drift with time; NaN of other terms.
+    #: Of a drift: change of the friction at the RMS speed [N m/min, N/min], and standard error.
     trend: tuple[float, float] = (math.nan, math.nan)
 
     def torque(self, motion: JointMotion) -> Array:
@@ -139,18 +136,13 @@ class Candidate:
 
     name: str  # Its name
     code: str  # Code of the finding that reports it
-    #: Columns of its c parameters in N samples, shape (N, c). They are scaled by the motion given,
-    #: unless that names another motion
-    columns: Callable[[JointMotion], Array]
+    columns: Callable[[JointMotion], Array]  # (N, c), scaled by that motion or the one it names
     meaning: str  # Description of the term for a finding
     advice: str = ""  # Remedy other than adding it to the model; empty if none
-    #: Unit of the parameter of a revolute and of a prismatic joint; None: the size is the RMS
-    #: torque of the term
+    #: Unit of the parameter of a revolute and a prismatic joint; None: its size is an RMS torque.
     units: tuple[str, str] | None = None
     revolute_only: bool = False  # Whether only a revolute joint has it
-    #: Friction families of a job that contain it, see ``FAMILIES``. The first one for which the
-    #: joint moved far enough is advised
-    families: tuple[str, ...] = ()
+    families: tuple[str, ...] = ()  # of ``FAMILIES`` that contain it, the best advice first
     #: Terms of a job's [drives] that are equal to it, if no family is
     terms: tuple[DriveTerm, ...] = ()
     tried: int = 1  # Number of such terms among which the residual selected it
@@ -242,8 +234,7 @@ def _coupled(m: JointMotion, other: str, ratio: float) -> Array:
     return np.column_stack([partner.a, partner.v, np.tanh(w / (_REVERSES * _rms(m, drive_speed)))])
 
 
-#: The candidates of each joint, without couplings: Coulomb friction where the model lacks it, the
-#: families of drive terms, and effects that no term models.
+#: The candidates of each joint, without couplings and ripples, an entry each.
 CANDIDATES = (
     Candidate(
         "coulomb", "friction_shape", lambda m: m.direction[:, None], "Coulomb friction",
@@ -336,8 +327,8 @@ def _advice(term: Candidate, setting: str) -> str:
         return term.advice
     table, *lines = setting.split("\n")
     if term.coupled:
-        size = "with the second ratio from the data sheet"
-        return f"Add {table} to the job: {' and '.join(lines)}, {size}"
+        added = f"Add {table} to the job: {' and '.join(lines)}"
+        return f"{added}, with the second ratio from the data sheet"
     added = f"add it to the model with {lines[0]} in {table}"
     return f"{term.advice}, or {added}" if term.advice else f"{added[0].upper()}{added[1:]}"
 

@@ -1,14 +1,12 @@
 """Standard errors that include model errors: missing drive terms, and uncertain friction shapes.
 
-A term that the drives have and the model lacks changes the other parameters by -T theta, with its
-own parameters theta. This is a bias and does not decrease with the length of the log: its square
-is added to their covariance. So is that of a term that was nearly selected. A fitted shape has a
-standard error, which adds to theirs:
+A term with parameters theta that the model lacks, or that was nearly selected, changes the others
+by -T theta, a bias: its square is added to their covariance. So is the error of a fitted shape:
 
     C += sum_terms (T theta) (T theta)^T + sum_joints T C_s T^T,  T = (W^T W + C_0^-1)^-1 W^T z
 
-The error of a prediction has two parts, the changed parameters and the missing torque, which partly
-cancel: W T theta - z theta. Hence each term is stored as an ``OpenTerm``, with its part of C.
+In a prediction changed parameters and missing torque partly cancel, W T theta - z theta: each term
+is stored as an ``OpenTerm``.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -21,7 +19,7 @@ from robotid.base.typing import Array
 from robotid.diagnosis.decisions import GROWN, ROUNDING, STEP, TINY
 from robotid.diagnosis.residual.misfit import Misfit
 from robotid.diagnosis.residual.term_trials import RIDGE, Sample, Trial, Trials, take_sample
-from robotid.dynamics.prediction import drive_motion_along
+from robotid.dynamics.torque import drive_motion_along
 from robotid.estimation.fitting.drive_terms import DriveChoice, JointMotion, OpenTerm
 from robotid.estimation.fitting.fitted import Fit, Solution
 from robotid.robot.drive_term import DriveMotion, DriveTerm

@@ -1,12 +1,12 @@
 """Samples of the recordings for tests of terms, and trials of columns added to the regressor.
 
-Columns Z of a candidate term are added to the regressor. Its parameters theta are refitted together
-with the base parameters, with one segment of the logs held out after the other:
+Columns Z are added to the regressor. Their parameters theta are refitted with the base parameters,
+with one segment of the logs held out after the other:
 
     r = W delta + Z theta + e,    theta = (Z^T M Z)^-1 Z^T M r,    M = 1 - W (W^T W + C^-1)^-1 W^T,
 
-so that what base parameters can explain does not count (Frisch, Waugh 1933). C is their prior
-covariance. A term that is not in the data does not reduce the residual of held-out segments.
+so that what base parameters, with prior covariance C, can explain does not count (Frisch, Waugh
+1933). A term that is not in the data does not reduce the residual of held-out segments.
 ``Trials.accepted`` is the one comparison of all readings: of the drives' terms (``misfit``) and of
 recordings and the URDF (``discrepancies``).
 
@@ -37,8 +37,7 @@ from robotid.estimation.fitting.evaluation import Evaluation, Recording
 from robotid.estimation.fitting.fitted import Solution
 from robotid.robot.model import RobotModel
 
-#: Smallest share of a column that the regressor must not explain.
-RIDGE = 1e-4
+RIDGE = 1e-4  # Smallest share of a column that the regressor must not explain
 _ROWS = 3000  # samples of all fitted logs together, and of all validation logs
 _NUMBERS = 2**24  # elements of their regressor
 _PER_INDEPENDENT = 2.0  # samples per independent one behind the filter
@@ -98,15 +97,13 @@ class Sample:
     recordings: tuple[Recording, ...]  # the fitted ones, then those of validation, if used
     at: tuple[Trajectory, ...]  # their motions at these samples
     taken: tuple[Array, ...]  # indices of these samples in each recording
-    #: (N, n_rows), weights of the torques [1/(N m), 1/N]; one for all rows if constraint forces
-    #: were eliminated.
-    weight: Array
+    weight: (
+        Array  # (N, n_rows), of torques [1/(N m), 1/N]; alike if constraint forces are eliminated
+    )
     torque: Array  # (n_rows,), weighted sum of the squared torques of fitted samples
     segments: tuple[slice, ...]  # samples of each of the K segments, of validation logs last
     rows: int  # number of samples of fitted logs
-    #: (N, n_rows, b), regressor of the base parameters over their prior spread, and columns that
-    #: are refitted with them.
-    W: Array
+    W: Array  # (N, n_rows, b), regressor of base parameters over their spread, and more columns
     r: Array  # (N, n_rows), residual of the estimate
     independent: Array  # (b,), columns of the regressor that belong to base parameters
     U: Array  # (b, b), factor of the prior covariance of base parameters, C = U^T U
@@ -427,7 +424,8 @@ class Trials:
         ends = np.cumsum([Z.shape[2] for Z in columns.values()]).tolist()
         each = zip(columns.items(), ends, strict=True)
         place = {option: list(range(end - Z.shape[2], end)) for (option, Z), end in each}
-        return cls(sample, np.concatenate(list(columns.values()), axis=2)), place
+        none = np.empty((*sample.r.shape, 0))  # there may be no options
+        return cls(sample, np.concatenate([none, *columns.values()], axis=2)), place
 
     @cached_property
     def held_out(self) -> Trial:

@@ -19,9 +19,9 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import sentence_of
-from robotid.dynamics.prediction import predict, rigid_parts
 from robotid.dynamics.prepared_logs import independent_share
 from robotid.dynamics.rows import drive_values, friction_directions
+from robotid.dynamics.torque import predict, rigid_parts
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.fitted import Fit
 from robotid.robot.model import RobotModel
@@ -54,11 +54,9 @@ class TorqueSplit:
     def terms_of(self, row: int) -> dict[str, dict[str, Array]]:
         """Return the torque (N,) of each drive parameter in a row, by part and name."""
         terms: dict[str, dict[str, Array]] = {}
-        for name, kind, ratio, torque in zip(
-            self.names, self.kinds, self.loads[row], self.terms, strict=True
-        ):
-            if ratio:
-                terms.setdefault(kind, {})[name] = ratio * torque
+        for k in np.flatnonzero(self.loads[row]):
+            of_kind = terms.setdefault(self.kinds[k], {})
+            of_kind[self.names[k]] = self.loads[row, k] * self.terms[k]
         return terms
 
 
@@ -98,19 +96,16 @@ class Rows:
         starts = np.flatnonzero(np.diff(self.recording, prepend=-1))
         if len(starts) == 1:
             return self.t
-        lengths = np.array([np.ptp(self.t[self.recording == k]) for k in range(len(starts))])
-        before = np.concatenate([[0.0], np.cumsum(lengths)[:-1]])
-        return np.asarray(self.t - self.t[starts][self.recording] + before[self.recording])
+        lengths = [np.ptp(part) for part in np.split(self.t, starts[1:])]
+        shift = np.cumsum([0.0, *lengths[:-1]]) - self.t[starts]
+        return np.asarray(self.t + shift[self.recording])
 
     @cached_property
     def pieces(self) -> Array:
         """Piece of each sample, 16 per recording, numbered on, shape (N,), int."""
-        count = _QUARTERS**2
-        pieces = np.empty(len(self.t), dtype=int)
-        for k in range(len(self.recordings)):
-            own = self.recording == k
-            pieces[own] = count * k + np.arange(own.sum()) * count // max(own.sum(), 1)
-        return pieces
+        rows, count = np.bincount(self.recording), _QUARTERS**2
+        place = np.arange(len(self.t)) - np.repeat(np.cumsum(rows) - rows, rows)
+        return np.asarray(count * self.recording + place * count // np.repeat(rows, rows))
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,8 +121,7 @@ class JointTorque:
     terms: Mapping[str, Mapping[str, Array]]  # (N,) of each drive parameter, by part and name
     #: Quantities that the residual may depend on: unit and values, (N,), by name.
     quantities: Mapping[str, tuple[str, Array]]
-    #: Share of the squared residual above the filter's cut-off: not correlated over one period of
-    #: it, or from sample to sample without a filter; None if not available.
+    #: Share of the squared residual above the filter's cut-off, or white; None if not available.
     broadband: float | None
     fitted: JointTorque | None = None  # of the fitted recordings; None if it is of them itself
 
@@ -338,11 +332,8 @@ class Dependence:
     unit: str  # of the quantity
     centres: Array  # (B,), mean of the quantity in each bin
     means: Array  # (B,), mean residual in each bin [N m or N]
-    #: (B,), standard error of these means, from their scatter between segments; NaN in bins of
-    #: fewer than three segments.
-    errors: Array
-    #: Share of the residual's variance that the means of other segments explain; None if there are
-    #: too few segments. A negative share means that they explain nothing.
+    errors: Array  # (B,), standard errors of the means between segments; NaN for fewer than three
+    #: Share of the variance that the means of other segments explain; None with too few segments.
     share: float | None
     p_value: float  # p-value of that share [-]
 

@@ -17,7 +17,7 @@ from robotid.robot.geometry import body_points, kinematic_lengths
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.prior import REASONS, assumed_masses
-from robotid.robot.tree import Inertial, Joint, Tree, exact_angle, numbers
+from robotid.robot.tree import Inertial, Tree, exact_angle, numbers
 
 #: Findings that take the URDF's masses as evidence.
 _OF_MASSES = (
@@ -51,13 +51,11 @@ def assumed_inertials(model: RobotModel) -> list[Finding]:
         bodies = [body for body in model.layout.bodies if model.assumed.get(body) == code]
         if bodies:
             mass = sum(float(pi[10 * model.layout.bodies.index(body)]) for body in bodies)
-            findings += [
-                finding(
-                    code, subject=f"link {bodies[0]}", severity="warning", what="assumed",
-                    cure="assumed", reason=reason, links=listed(bodies, 12), bodies=len(bodies),
-                    mass=mass,
-                )
-            ]  # fmt: skip
+            one = finding(
+                code, subject=f"link {bodies[0]}", severity="warning", what="assumed", mass=mass,
+                cure="assumed", reason=reason, links=listed(bodies, 12), bodies=len(bodies),
+            )  # fmt: skip
+            findings.append(one)
     return findings
 
 
@@ -146,13 +144,12 @@ def _between(mapping: BaseMapping) -> int:
 
 def _rounded(tree: Tree) -> dict[str, dict[str, float]]:
     """Return the rounded angles of each joint, as written, and the exact angles."""
-    rounded = {}
+    rounded: dict[str, dict[str, float]] = {}
     for joint in tree.robot.findall("joint"):
         origin = joint.find("origin")
-        words = origin.get("rpy", "").split() if origin is not None else []
-        exact = {word: angle for word in words if (angle := exact_angle(word)) is not None}
-        if exact:
-            rounded[joint.get("name", "")] = exact
+        for word in origin.get("rpy", "").split() if origin is not None else []:
+            if (angle := exact_angle(word)) is not None:
+                rounded.setdefault(joint.get("name", ""), {})[word] = angle
     return rounded
 
 
@@ -171,12 +168,11 @@ def _effect(model: RobotModel, mapping: BaseMapping) -> tuple[str, dict[str, flo
 def _carrying(tree: Tree) -> set[str]:
     """Return the joints that move or carry a moving joint: their angles affect the dynamics."""
     arriving = {joint.child: joint for joint in tree.joints}
-    carrying: set[str] = set()
+    carrying = {joint.name for joint in tree.movable}
     for joint in tree.movable:
-        at: Joint | None = joint
-        while at is not None and at.name not in carrying:
-            carrying.add(at.name)
-            at = arriving.get(at.parent)
+        while joint.parent in arriving:
+            joint = arriving[joint.parent]
+            carrying.add(joint.name)
     return carrying
 
 

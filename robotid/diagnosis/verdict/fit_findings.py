@@ -194,11 +194,11 @@ def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]
 def _in_line(model: RobotModel) -> set[str]:
     """Return the joints that carry an identified joint, or are carried by one."""
     above = {joint.child: joint for joint in model.tree.joints}
-    carriers: dict[str, set[str]] = {}
+    carriers: dict[str, set[str]] = {joint.name: set() for joint in model.tree.joints}
     for joint in model.tree.joints:
-        own, link = carriers.setdefault(joint.name, set()), joint.parent
+        link = joint.parent
         while link in above:
-            own.add(above[link].name)
+            carriers[joint.name].add(above[link].name)
             link = above[link].parent
     identified = set(model.joints)
     carrying = set[str]().union(*(carriers[name] for name in identified))
@@ -297,16 +297,17 @@ def _impossible_shapes(fit: Fit) -> Iterator[Finding]:
         if body in negligible:  # it keeps the URDF's values, and has no effect
             continue
         if (fault.code, fault.where) in before:
-            fault = fault.reworded(severity="note", remedy="; the URDF has the same fault")
-        else:
-            fault = fault.reworded(fault=f"as identified, {fault.fault}")
-            remedy = f". {_cure(fit, body)}. The predicted torque may still be right; do not use "
-            remedy += "mass, centre of mass and inertia of this link"
-            if _is_within_box(fit, body, boxes[body]):
-                fault = fault.reworded(severity="note")
-                remedy = "; it is within the margin of the fit"
-            fault = fault.reworded(remedy=remedy)
-        yield fault
+            yield fault.reworded(severity="note", remedy="; the URDF has the same fault")
+            continue
+        severity, remedy = (
+            fault.severity,
+            f". {_cure(fit, body)}. The predicted torque may still be ",
+        )
+        remedy += "right; do not use mass, centre of mass and inertia of this link"
+        if _is_within_box(fit, body, boxes[body]):
+            severity, remedy = "note", "; it is within the margin of the fit"
+        text = f"as identified, {fault.fault}"
+        yield fault.reworded(fault=text, severity=severity, remedy=remedy)
 
 
 def _dense_bodies(fit: Fit) -> Iterator[Finding]:

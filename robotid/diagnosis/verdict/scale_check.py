@@ -15,8 +15,7 @@ from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import sentence_of
 from robotid.diagnosis.decisions import AGREES, DIFFERS, TINY
 from robotid.dynamics.constraint_rows import loop_basis, without_forces
-from robotid.dynamics.prediction import predict
-from robotid.dynamics.torque import joint_torque_regressor
+from robotid.dynamics.torque import joint_torque_regressor, predict
 from robotid.estimation.fitting.fitted import Fit
 from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.robot.parameters import pseudo_inertia
@@ -75,9 +74,7 @@ class StatedMass(KnownMass):
     """Masses that the user states, and what torque alone determines of them."""
 
     names: tuple[str, ...]  # "total_mass", or "mass of" a link
-    #: Mass that torque alone determines, without this statement and without the URDF's masses, over
-    #: the stated mass [-]; None if torque does not determine it.
-    ratio: float | None = None
+    ratio: float | None = None  # mass that torque alone determines, over the stated one [-]
     half_width: float = 0.0  # of its 95 % interval, plus that of the stated range [-]
     absorbed_by: tuple[str, ...] = ()  # links that take up the mass while no torque changes
     kind: ClassVar[str] = "stated mass"
@@ -162,20 +159,15 @@ class ScaleCheck:
     masses: tuple[float, float, float] = (0.0, 0.0, 0.0)
     stated: StatedMass | None = None
     payloads: tuple[PayloadCheck, ...] = ()  # that with the narrowest interval first
-    #: Whether torque alone determines the total mass within 5 %, so that a measured one verifies
-    #: the scale.
-    is_total_determined: bool = False
+    is_total_determined: bool = (
+        False  # within 5 % by torque alone: a measured one verifies the scale
+    )
     friction: Mapping[str, float] = field(default_factory=dict)  # its share of each torque [-]
-    #: Whether the result fits the data about as well as WLS. A result that its prior determines
-    #: agrees with the URDF whatever the sensors measured.
-    follows: bool = True
-    #: Factor common to the ratios of the joints, and half the width of its 95 % interval [-], as
-    #: errors of the URDF spread the ratios; None with fewer than two.
+    follows: bool = True  # the data, about as well as WLS, and not the prior
+    #: Factor common to the joints' ratios and its 95 % half-width [-]; None with fewer than two.
     common: tuple[float, float] | None = None
     mass_error: float = 0.0  # standard error of the identified total mass [kg]
-    #: Number of links whose inertials are assumed, so that gravity and mass of the URDF are no
-    #: evidence.
-    assumed: int = 0
+    assumed: int = 0  # number of links with assumed inertials: the URDF is no evidence
 
     @property
     def agrees(self) -> bool:
@@ -429,8 +421,7 @@ def stated_mass(fit: Fit) -> StatedMass | None:
     # A range wider than +- 5 % is a bound, not a statement. So is the mass of a pinned link.
     layout, bounds = fit.model.layout, fit.estimator.bounds
     stated = {f"mass of {link}": (link, pair) for link, pair in bounds.masses.items()}
-    if bounds.total is not None:
-        stated["total_mass"] = ("", bounds.total)
+    stated |= {} if bounds.total is None else {"total_mass": ("", bounds.total)}
     names, rows, widths = [], [], []
     for name, (link, (low, high)) in stated.items():
         centre, width = 0.5 * (low + high), 0.5 * (high - low)

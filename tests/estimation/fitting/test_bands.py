@@ -15,12 +15,7 @@ from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.fitting.drive_terms import OpenTerm
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.evaluation import Evaluation
-from robotid.estimation.fitting.fitted import (
-    Fit,
-    expected_band,
-    friction_curve,
-    next_errors,
-)
+from robotid.estimation.fitting.fitted import Fit, expected_band, friction_curve, next_errors
 from robotid.estimation.fitting.standard_errors import TorqueBand, rms_error, torque_band
 from robotid.robot.drives import LoadFriction, PositionCoulomb
 from robotid.robot.examples import example_urdf

@@ -14,11 +14,7 @@ from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors, merge
 from robotid.estimation.estimators import OLS, WLS
 from robotid.estimation.estimators.estimator import scatter
-from robotid.estimation.fitting.standard_errors import (
-    measured_errors,
-    standard_of,
-    with_wls_errors,
-)
+from robotid.estimation.fitting.standard_errors import measured_errors, standard_of, with_wls_errors
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

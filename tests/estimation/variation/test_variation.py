@@ -20,11 +20,7 @@ from robotid.estimation.variation.groups import (
     sums_of,
 )
 from robotid.estimation.variation.spread import Runs, SpreadModel
-from robotid.estimation.variation.variation import (
-    between_covariance,
-    shrunk_correlation,
-    vary,
-)
+from robotid.estimation.variation.variation import between_covariance, shrunk_correlation, vary
 from robotid.robot.model import RobotModel
 
 NAMES = [f"run_{k}.csv" for k in range(6)]
