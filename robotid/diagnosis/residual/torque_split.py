@@ -54,11 +54,9 @@ class TorqueSplit:
     def terms_of(self, row: int) -> dict[str, dict[str, Array]]:
         """Return the torque (N,) of each drive parameter in a row, by part and name."""
         terms: dict[str, dict[str, Array]] = {}
-        for name, kind, ratio, torque in zip(
-            self.names, self.kinds, self.loads[row], self.terms, strict=True
-        ):
-            if ratio:
-                terms.setdefault(kind, {})[name] = ratio * torque
+        for k in np.flatnonzero(self.loads[row]):
+            of_kind = terms.setdefault(self.kinds[k], {})
+            of_kind[self.names[k]] = self.loads[row, k] * self.terms[k]
         return terms
 
 

@@ -421,8 +421,7 @@ def stated_mass(fit: Fit) -> StatedMass | None:
     # A range wider than +- 5 % is a bound, not a statement. So is the mass of a pinned link.
     layout, bounds = fit.model.layout, fit.estimator.bounds
     stated = {f"mass of {link}": (link, pair) for link, pair in bounds.masses.items()}
-    if bounds.total is not None:
-        stated["total_mass"] = ("", bounds.total)
+    stated |= {} if bounds.total is None else {"total_mass": ("", bounds.total)}
     names, rows, widths = [], [], []
     for name, (link, (low, high)) in stated.items():
         centre, width = 0.5 * (low + high), 0.5 * (high - low)

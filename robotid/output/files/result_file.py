@@ -175,9 +175,9 @@ class Result:
     @property
     def rate(self) -> float | None:
         """Sampling rate of the controller of those drives [Hz]; None for continuous time."""
-        stated = self.content.get("simulation", {"controller": {}})["controller"]
-        rate: float | None = stated.get("rate")
-        return rate
+        controller: dict[str, float | None]
+        controller = self.content.get("simulation", {"controller": {}})["controller"]
+        return controller.get("rate")
 
     def follow_commands(self, log: Log) -> Array:
         """Return the encoder readings simulated on a log's commands, (N, n) [rad or m]."""

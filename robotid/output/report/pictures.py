@@ -24,16 +24,10 @@ _DWARFED = 4.0  # times the height of the measured torque above which the URDF's
 _PIXELS = 500  # spans closer than one of these pixels are merged
 _POINTS = 400  # of a chart of the residual analysis, or of friction
 _TONES = {
-    "gravity": "tone-1",
-    "inertia": "tone-4",
-    "Coriolis": "tone-7",
-    "friction": "tone-3",
-    "motor inertia": "tone-6",
-    "offset": "tone-8",
-    "spring": "tone-5",
-    "ripple": "urdf",
+    "gravity": "tone-1", "inertia": "tone-4", "Coriolis": "tone-7", "friction": "tone-3",
+    "motor inertia": "tone-6", "offset": "tone-8", "spring": "tone-5", "ripple": "urdf",
     "delay": "quiet",
-}
+}  # fmt: skip
 
 
 def plot_torques(
