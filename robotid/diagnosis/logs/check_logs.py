@@ -17,14 +17,8 @@ from robotid.base.typing import Array
 from robotid.data.log import REPEATED, Log, Trajectory, repeated_share
 from robotid.data.signal_settings import LogUnits, SignalSettings
 from robotid.diagnosis.catalogue import finding
+from robotid.diagnosis.logs import channels
 from robotid.diagnosis.logs.base_checks import check_base
-from robotid.diagnosis.logs.channels import (
-    STILL,
-    check_channels,
-    check_clock,
-    check_rest,
-    check_torque_channels,
-)
 from robotid.diagnosis.logs.command_channels import check_commands
 from robotid.diagnosis.logs.hypotheses import Probe, smooth_motion, take_probe
 from robotid.diagnosis.logs.torque_checks import check_payload_change, check_torques, reductions_of
@@ -94,12 +88,12 @@ def _examine_log(
     findings += [finding("log_note", name, text=note) for note in log.notes]
     findings += [finding("log_assumption", name, text=text) for text in log.assumed]
     if not model.is_static:  # rows of static poses may have gaps between them
-        findings += [*check_clock(log), *check_channels(log, signals)]
+        findings += [*channels.check_clock(log), *channels.check_channels(log, signals)]
     prismatic = [limit.name for limit in model.limits if limit.type == "prismatic"]
     findings += check_commands(log, prismatic)
     driven = [joint for joint in log.joints if joint not in model.passive]
     has_torque = log.has_torque and bool(driven)
-    sizes = list(check_torque_channels(log.select(driven))) if has_torque else []
+    sizes = list(channels.check_torque_channels(log.select(driven))) if has_torque else []
     findings += sizes
     if model.free_flyer or model.constraints or model.passive:
         findings.append(finding("floating_base", name))
@@ -112,7 +106,7 @@ def _examine_log(
     except DataError as error:
         findings.append(Finding(error.code, "error", name, str(error), log=name))
         return None, None
-    findings += check_rest(log, motion, model.layout)
+    findings += channels.check_rest(log, motion, model.layout)
     if not log.has_torque:
         return motion, None
     probe = take_probe(model, motion)
@@ -179,9 +173,9 @@ def check_locked(
     for joint, q in positions.items():
         stated = model.locked[joint]
         middle, extent = float(np.median(q)), float(np.ptp(q))
-        if extent <= STILL and abs(middle - stated) <= STILL:
+        if extent <= channels.STILL and abs(middle - stated) <= channels.STILL:
             continue
-        what = "moves" if extent > STILL else "stands"
+        what = "moves" if extent > channels.STILL else "stands"
         yield finding(
             "locked_position", log, joint, what=what, todo=what, default=joint in asked,
             unit="m" if types[joint] == "prismatic" else "rad", stated=stated, median=middle,
