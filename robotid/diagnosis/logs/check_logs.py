@@ -27,13 +27,7 @@ from robotid.diagnosis.urdf.inertials import assumed_inertials, explained_by_ass
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.factors import Reduction, compress, merge
 from robotid.dynamics.prepared_logs import base_problem, independent_share, row_mask
-from robotid.estimation.estimators import WLS, Estimate
-from robotid.estimation.estimators.determination import (
-    Determination,
-    base_spread,
-    determine,
-    is_poorly_excited,
-)
+from robotid.estimation.estimators import WLS, Estimate, determination
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread, with_assumed_inertials
 
@@ -126,7 +120,7 @@ def check_excitation(
     model: RobotModel, mapping: BaseMapping, motions: Sequence[Trajectory],
     signals: SignalSettings, name: str,
 ) -> Iterator[Finding]:  # fmt: skip
-    """Yield which base parameters the fitted motions determine, by ``determine``."""
+    """Yield which base parameters the fitted motions determine."""
     prior, step = model.standard_parameters(), -(-max(len(m.t) for m in motions) // _ROWS)
     thinned = [motion.every(step) for motion in motions]
     try:
@@ -146,17 +140,18 @@ def check_excitation(
     squares = np.sum([motion.squares for motion in thinned], axis=0)
     spread = prior_spread(model, squares, sum(len(motion.t) for motion in thinned))
     rows = factors.weighted(wls.sigma / np.sqrt(share))[:, :-1]
-    known = determine(mapping.base_names, rows, base_spread(mapping.K, spread))
+    spread = determination.base_spread(mapping.K, spread)
+    known = determination.determine(mapping.base_names, rows, spread)
     yield excitation_finding(wls, known, name)
 
 
-def excitation_finding(wls: Estimate, known: Determination, name: str) -> Finding:
+def excitation_finding(wls: Estimate, known: determination.Determination, name: str) -> Finding:
     """Return the finding on which base parameters a motion determines."""
     evidence = {"rank": known.rank, "base": len(known.names), "weakest": known.shrinkage[-1]}
     if np.isfinite(wls.condition):
         evidence["condition"] = wls.condition
     kinds = ("poor", "lost") if known.groups else ("weak", "good")
-    todo = kinds[not is_poorly_excited(wls, len(known.names))]
+    todo = kinds[not determination.is_poorly_excited(wls, len(known.names))]
     return finding(
         "excitation", name, severity="warning" if todo == "poor" else "note", what="rank",
         todo=todo, described=known.described() if known.groups else "",
