@@ -29,9 +29,9 @@ from robotid.cli.job import Job, LogEntry, job_from_settings
 from robotid.data.files.read import write_columns, write_log
 from robotid.design.excitation import write_motion
 from robotid.diagnosis.catalogue import entries
-from robotid.dynamics.prediction import predict_instants
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Simulation
+from robotid.dynamics.torque import predict_instants
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.output.files.ranges import sample
 from robotid.robot import examples

@@ -33,8 +33,8 @@ from robotid.data.signals import low_pass
 from robotid.diagnosis.logs.check_logs import excitation_finding
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.factors import Factors, compress, join, merge
-from robotid.dynamics.prediction import predict, predict_instants
 from robotid.dynamics.prepared_logs import base_problem, independent_share
+from robotid.dynamics.torque import predict, predict_instants
 from robotid.estimation.estimators import Estimate
 from robotid.estimation.estimators.batch import solve_factor
 from robotid.estimation.estimators.determination import base_spread, determine

@@ -20,8 +20,7 @@ from robotid.dynamics.constraint_rows import (
     without_forces,
 )
 from robotid.dynamics.factors import compress, compress_segments, merge
-from robotid.dynamics.prediction import predict
-from robotid.dynamics.torque import build_problem, joint_torque_regressor
+from robotid.dynamics.torque import build_problem, joint_torque_regressor, predict
 from robotid.robot.constraints import Contact, Loop
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

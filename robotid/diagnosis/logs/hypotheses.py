@@ -15,7 +15,7 @@ from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process, resolve, unwrap
 from robotid.diagnosis.decisions import TINY
-from robotid.diagnosis.logs.channels import AT_REST, ZERO, distance
+from robotid.diagnosis.logs.channels import AT_REST, ZERO
 from robotid.dynamics.rows import drive_values, friction_directions, friction_speeds, inertial_rows
 from robotid.robot.model import GRAVITY, RobotModel
 
@@ -134,9 +134,11 @@ def smooth_motion(model: RobotModel, log: Log, settings: SignalSettings) -> Traj
 
 def take_probe(model: RobotModel, motion: Trajectory, *, samples: int = 500) -> Probe | None:
     """Return a probe of a motion, None if the motion is too small for any check."""
-    starts = np.flatnonzero(np.diff(motion.segment, prepend=-1))
-    ends = motion.t[np.sort([*starts, *(starts - 1)[1:], len(motion.t) - 1])]
-    inner = distance(motion.t, ends) >= _MARGIN  # far from the ends of its segment
+    inner = np.ones(len(motion.t), dtype=bool)  # far from the ends of the segment
+    for number in np.unique(motion.segment):
+        part = motion.segment == number
+        t = motion.t[part]
+        inner[part] = (t >= t[0] + _MARGIN) & (t <= t[-1] - _MARGIN)
     slow = AT_REST * model.layout.drive_speeds[: len(model.joints)]
     rows = np.flatnonzero((np.abs(motion.v) > slow).any(axis=1) & inner)
     if len(rows) < 50:

@@ -23,7 +23,7 @@ from robotid.base.typing import Array
 from robotid.diagnosis import decisions
 from robotid.diagnosis.decisions import Round, select
 from robotid.diagnosis.residual.term_trials import Sample, Trial, Trials, take_sample
-from robotid.dynamics.prediction import drive_motion_along
+from robotid.dynamics.torque import drive_motion_along
 from robotid.estimation.fitting.drive_terms import DriveChoice, FoundShape, Tried, with_shapes
 from robotid.estimation.fitting.fitted import Solution
 from robotid.robot.drive_term import DataRange, DriveMotion, DriveTerm, Family, MemorylessTerm

@@ -274,17 +274,16 @@ def uses_line(uses: Mapping[str, str]) -> str:
 
 def _predicted(joints: Mapping[str, str]) -> str:
     """Return whether the predictions of joints can be used."""
-    tested = {joint: status for joint, status in joints.items() if status != "not evaluated"}
-    if not tested:
+    statuses = set(joints.values())
+    if statuses <= {"not evaluated"}:
         return _NOT_VERIFIED
-    poor = [joint for joint, status in tested.items() if status == "poor"]
-    if len(poor) == len(tested):
+    if statuses <= {"not evaluated", "poor"}:
         return "no, the errors on validation logs are large"
-    if poor:
+    if "poor" in statuses:
         return f"yes, without {_named(joints, 'poor')}"
-    if len(tested) < len(joints):
+    if "not evaluated" in statuses:
         return f"yes, without {_named(joints, 'not evaluated')} (not evaluated)"
-    return "yes, with the warnings" if "usable" in tested.values() else "yes"
+    return "yes, with the warnings" if "usable" in statuses else "yes"
 
 
 def _named(joints: Mapping[str, str], status: str) -> str:
@@ -422,8 +421,7 @@ def _largest_error(
     cause, advice = cause_of(last)
     text = f"largest error of the good joints: {'. '.join(filter(None, (cause, advice)))}"
     per_joint[last] = replace(per_joint[last], reasons=(*per_joint[last].reasons, text))
-    is_all = len(good) == len(per_joint)
-    return [f"{last}: largest error: {cause}"] if is_all else []
+    return [f"{last}: largest error: {cause}"] if len(good) == len(per_joint) else []
 
 
 def concluded(
@@ -511,10 +509,8 @@ def warnings_of(
     """Return the warnings of a verdict that follow from findings, each once."""
     jumps = {(f.log, f.joints) for f in findings if is_robust and is_downweighted(f)}
     warnings: list[VerdictWarning] = []
-    for one in findings:
-        is_known = one.code in codes_with("verdict")
-        if one.severity != "warning" or not is_known or one.code == "repeated_motion":
-            continue
+    known = {*codes_with("verdict")} - {"repeated_motion"}
+    for one in (one for one in findings if one.severity == "warning" and one.code in known):
         # the unexplained torque is the spikes, which a robust fit downweights
         is_jump = one.code == "unexplained_torque" and (one.log, one.joints) in jumps
         if not is_jump and not _is_harmless(one):

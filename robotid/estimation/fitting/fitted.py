@@ -21,7 +21,7 @@ from robotid.dynamics.friction_projection import (
     drive_moments,
     projected_pinocchio_model,
 )
-from robotid.dynamics.prediction import drive_motion_along, predict_instants
+from robotid.dynamics.torque import drive_motion_along, predict_instants
 from robotid.estimation.estimators import Estimate
 from robotid.estimation.estimators.determination import Determination, is_poorly_excited
 from robotid.estimation.fitting.drive_terms import DriveChoice, JointMotion, OpenTerm, open_torques

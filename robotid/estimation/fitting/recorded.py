@@ -43,7 +43,6 @@ from robotid.dynamics.factors import (
     concatenate,
     join_segments,
 )
-from robotid.dynamics.prediction import is_loaded, remember
 from robotid.dynamics.prepared_logs import (
     base_problem,
     closed_log,
@@ -54,6 +53,7 @@ from robotid.dynamics.prepared_logs import (
     with_contacts,
 )
 from robotid.dynamics.rows import COMPILED, choose_engine, friction_speeds, keep_inertial_rows
+from robotid.dynamics.torque import is_loaded, remember
 from robotid.estimation.work_plan import WorkPlan
 from robotid.robot.model import RobotModel
 

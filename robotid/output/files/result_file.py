@@ -19,7 +19,7 @@ from robotid.data.log import Log, suggestion
 from robotid.diagnosis.verdict.parameter_table import parameter_table
 from robotid.diagnosis.verdict.scale_check import PayloadCheck, ScaleCheck, StatedMass
 from robotid.dynamics.friction_projection import DriveMoments, projected_pinocchio_model
-from robotid.dynamics.prediction import predict_instants
+from robotid.dynamics.torque import predict_instants
 from robotid.estimation.fitting.standard_errors import FrictionCurve
 from robotid.estimation.variation.groups import RunSums
 from robotid.estimation.variation.variation import between_covariance

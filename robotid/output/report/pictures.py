@@ -14,7 +14,7 @@ from robotid.diagnosis.residual.torque_split import (
     friction_split,
     spread_rows,
 )
-from robotid.dynamics.prediction import drive_motion_along
+from robotid.dynamics.torque import drive_motion_along
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.fitted import friction_curve
 from robotid.estimation.fitting.standard_errors import QUANTILE, TorqueBand

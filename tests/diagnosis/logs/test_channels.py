@@ -1,19 +1,16 @@
 """Spikes and limits of a channel, told from a joint that rests, a sensor's step, a dead torque."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.findings import Figures
 
-from robotid.cli.job import LogEntry, read_job
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.channels import check_channels, check_torque_channels
 
 RATE, N = 500.0, 20000  # [Hz], rows of 40 s
-JOB = Path(__file__).parents[2] / "jobs" / "ur10e.toml"
 
 
 def log_of_two(q=None, tau=None, moving=1.0):
@@ -80,15 +77,6 @@ def test_spikes_of_a_velocity_that_is_not_used_are_a_note():
     assert {f.severity for f in found_of(coarse, "spikes")} == {"note"}
 
 
-@pytest.mark.parametrize("number", [1, 2, 3, 4, 5, 6])
-def test_joints_at_rest_in_a_real_recording_raise_no_alarm(recordings, monkeypatch, number):
-    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
-    job = read_job(JOB)
-    path = recordings / "ur10e" / f"jointwise_{number}.parquet"
-    log = job.read(LogEntry(path), job.model())
-    assert "error" not in {f.severity for f in found_of(log, "spikes")}
-
-
 @pytest.mark.parametrize("value", [0.0, -0.0, 3.0])
 def test_a_torque_that_never_changes_is_dead_and_not_clipped(value):
     log = log_of_two(tau=np.full(N, value))
@@ -147,8 +135,6 @@ def test_the_delay_of_a_velocity_is_as_sure_as_joints_agree():
 
 
 # --- figures, by an independent computation -------------------------------------------------------
-
-
 T = 3.0 + np.arange(2000) / 100
 
 

@@ -20,8 +20,7 @@ from robotid.diagnosis.logs.check_logs import diagnose, findings_to_dict
 from robotid.diagnosis.urdf.inspection import inspect_urdf
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Sensors
-from robotid.dynamics.simulation.simulator import simulate
-from robotid.dynamics.simulation.truth import another_robot
+from robotid.dynamics.simulation.simulator import another_robot, simulate
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -299,8 +298,6 @@ def test_a_load_is_not_taken_for_another_gravity():
 
 
 # --- traps that the publishers of recordings warn of ----------------------------------------------
-
-
 JOBS = Path(__file__).parents[2] / "jobs"
 # what the notes of each set say, and the finding with the figure that tells it
 TRAPS = {

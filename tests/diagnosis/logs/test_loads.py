@@ -19,7 +19,7 @@ from robotid.diagnosis.logs.hypotheses import (
     take_probe,
 )
 from robotid.diagnosis.logs.torque_checks import load_model
-from robotid.dynamics.simulation.truth import another_robot
+from robotid.dynamics.simulation.simulator import another_robot
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -118,8 +118,6 @@ def test_the_fit_is_the_least_squares_of_all_joints_and_drives(ur5, ur5_log):
 
 
 # --- loads of validation logs alone ---------------------------------------------------------------
-
-
 CHANGES = {"payload_change", "payload"}
 
 
@@ -187,8 +185,6 @@ def test_a_load_is_named_beside_a_urdf_of_another_robot(arm_and_log):
 
 
 # --- probes ---------------------------------------------------------------------------------------
-
-
 def test_columns_of_coupled_drives_are_those_of_the_regressor(ur5, rng):
     coupling = Coupling("motor", (("wrist_2_joint", 1.0), ("wrist_3_joint", -2.0)))
     model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), couplings=(coupling,))

@@ -122,8 +122,6 @@ def test_columns_beside_are_each_as_free_as_what_is_left(sample, rng):
 
 
 # --- selection ------------------------------------------------------------------------------------
-
-
 RULE = Rule(most=3, share=0.05, p_value=0.01, alike=0.02)
 
 

@@ -328,8 +328,6 @@ def test_joints_better_by_the_urdf_are_those_of_all_logs():
 
 
 # --- uses -----------------------------------------------------------------------------------------
-
-
 VERIFIED = ScaleCheck({"a": 1.0, "b": 1.0}, scale=1.0, factor=1.0, masses=(20.0, 20.0, 0.0))
 OPEN = ScaleCheck({"a": 1.2, "b": 1.2}, scale=1.2, factor=1.2, masses=(20.0, 24.0, 0.0))
 WRONG = ScaleCheck({"a": 2.0}, scale=2.0, factor=2.0, masses=(20.0, 40.0, 0.0))
@@ -392,8 +390,6 @@ def test_the_scale_of_positions_comes_from_a_torque_only():
 
 
 # --- simulated positions --------------------------------------------------------------------------
-
-
 def judged_positions(errors, is_validation=True, joints=("a", "b"), **known):
     """Return the verdict on joints by their errors [%], or by errors with baselines."""
     per_joint = {}
