@@ -16,7 +16,7 @@ from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.interior_point import Entropic
 from robotid.estimation.fitting.estimator_settings import ConstraintSettings
 from robotid.estimation.fitting.fit import make_constraints
-from robotid.robot.geometry import body_boxes
+from robotid.robot.bodies import body_boxes
 from robotid.robot.parameters import ParameterLayout, inertial_from_pseudo_inertia, pseudo_inertia
 
 LAYOUT = ParameterLayout(bodies=("one", "two"), joints=("a", "b"), terms=("viscous",))
