@@ -17,14 +17,20 @@ from robotid.cli.identify import identify
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
-from robotid.dynamics import prediction
+from robotid.dynamics import torque
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.friction_projection import drive_moments, project_friction
-from robotid.dynamics.prediction import drive_motion_along, predict, remember
 from robotid.dynamics.rows import COMPILED, TrajectoryRows
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulator import RobotPlant
-from robotid.dynamics.torque import InstantRegressor, joint_torque_regressor, trajectory_regressor
+from robotid.dynamics.torque import (
+    InstantRegressor,
+    drive_motion_along,
+    joint_torque_regressor,
+    predict,
+    remember,
+    trajectory_regressor,
+)
 from robotid.output.files.mjcf import write_mjcf
 from robotid.output.files.urdf import load_identified, read_sidecar, write_urdf
 from robotid.output.report.pictures import friction_chart
@@ -377,7 +383,7 @@ def test_a_hook_that_only_slow_motion_shows_is_a_base_parameter():
 
 
 def test_what_drives_remember_is_of_the_model_not_of_what_was_remembered_before(rng, monkeypatch):
-    monkeypatch.setattr(prediction, "_START", 10**9)  # by rows, which check the memory
+    monkeypatch.setattr(torque, "_START", 10**9)  # by rows, which check the memory
     path, own = example_urdf("ur5_robot.urdf"), {"elbow_joint": [LoadFriction(), Lag()]}
     model = RobotModel.from_urdf(path, joints=JOINTS, own_terms=own)
     x, other = states(rng), model.with_reference(truth(model))

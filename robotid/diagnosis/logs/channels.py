@@ -298,16 +298,15 @@ def _rate(log: Log, step: Array, median: float) -> Iterator[Finding]:
 
 
 def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
-    gaps = np.flatnonzero(step > _GAP * median * (1 + 1e-6))
-    is_set = np.array([step[k] > _PAUSE and _goes_on(log.q, k) for k in gaps.tolist()], dtype=bool)
-    if is_set.any():
-        k = int(gaps[is_set][0])
-        jump, at = float(step[k]) - median, float(log.t[k])
-        yield finding("clock_step", log.name, jump=jump, at=at, steps=float(is_set.sum()))
-        gaps = gaps[~is_set]
-    if len(gaps) == 0:
+    every = np.flatnonzero(step > _GAP * median * (1 + 1e-6)).tolist()
+    jumps = [k for k in every if step[k] > _PAUSE and _goes_on(log.q, k)]
+    if jumps:
+        jump, at = step[jumps[0]] - median, log.t[jumps[0]]
+        yield finding("clock_step", log.name, jump=jump, at=at, steps=len(jumps))
+    gaps = [k for k in every if k not in jumps]
+    if not gaps:
         return
-    at = int(gaps[np.argmax(step[gaps])])
+    at = max(gaps, key=lambda k: step[k])
     longest, start = float(step[at]), float(log.t[at])
     severity = "warning" if longest > max(_LONG, _GAP * median) else "note"
     yield finding(
@@ -346,14 +345,14 @@ def _stale_rows(log: Log, step: Array) -> Iterator[Finding]:
     channels = np.hstack([x for x in (log.q, log.v, log.tau) if x is not None])
     same = (np.diff(channels, axis=0) == 0).all(axis=1)
     runs = _in_motion(log, runs_of(same))
-    stale = sum(stop - start for start, stop in runs)
-    if stale == 0:
+    if not runs:
         return
-    share, longest = stale / len(log.t), max(b - a for a, b in runs)
-    severity = "warning" if share > _STALE else "note"
+    lengths = [stop - start for start, stop in runs]
+    share = sum(lengths) / len(log.t)
     yield finding(
-        "stale_rows", log.name, severity=severity, rows=stale, share=share, longest_run=longest
-    )
+        "stale_rows", log.name, severity="warning" if share > _STALE else "note",
+        rows=sum(lengths), share=share, longest_run=max(lengths),
+    )  # fmt: skip
 
 
 def _in_motion(log: Log, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:

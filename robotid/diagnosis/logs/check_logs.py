@@ -158,14 +158,11 @@ def check_excitation(
 
 def excitation_finding(wls: Estimate, known: Determination, name: str) -> Finding:
     """Return the finding on which base parameters a motion determines."""
-    count = len(known.names)
-    evidence = {"rank": known.rank, "base": count, "weakest": known.shrinkage[-1]}
+    evidence = {"rank": known.rank, "base": len(known.names), "weakest": known.shrinkage[-1]}
     if np.isfinite(wls.condition):
         evidence["condition"] = wls.condition
-    is_poor = is_poorly_excited(wls, count)
-    todo = "poor" if is_poor else "lost"
-    if not known.groups:
-        todo = "weak" if is_poor else "good"
+    kinds = ("poor", "lost") if known.groups else ("weak", "good")
+    todo = kinds[not is_poorly_excited(wls, len(known.names))]
     return finding(
         "excitation", name, severity="warning" if todo == "poor" else "note", what="rank",
         todo=todo, described=known.described() if known.groups else "",

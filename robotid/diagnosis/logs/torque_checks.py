@@ -269,19 +269,16 @@ def _holds_no_gravity(probe: Probe) -> bool:
     # Both tests use the level of the logged torques, and no load on the last link.
     if not probe.gravity.any() or _holds_gravity(probe):
         return False
-    readings, ones = [(probe, own_share(probe)), compensated(probe)], np.ones(probe.tau.shape[1])
-    logged, corrected = (
-        load_model(reading, share, probe.tau.std(axis=0)).is_this_robot(ones)
-        for reading, share in readings
-    )
+    level, ones = probe.tau.std(axis=0), np.ones(probe.tau.shape[1])
+    readings = (probe, own_share(probe)), compensated(probe)
+    logged, corrected = (load_model(*x, level).is_this_robot(ones) for x in readings)
     return corrected and not logged
 
 
 def _holds_gravity(probe: Probe) -> bool:
     """Return whether the torque of a joint contains its gravity torque by the URDF."""
-    with_gravity, without = own_share(probe), own_share(probe, np.zeros(3))
-    followed = (with_gravity + FLOOR < _WRONG * (without + FLOOR)) & (without < 1.0)
-    return bool(followed.any())
+    share, without = own_share(probe), own_share(probe, np.zeros(3))
+    return bool(((share + FLOOR < _WRONG * (without + FLOOR)) & (without < 1.0)).any())
 
 
 def _error_of_links(theta: Array) -> float:

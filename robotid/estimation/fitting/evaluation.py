@@ -16,7 +16,7 @@ from robotid.data.log import Log, Trajectory, alike_motions
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import turns_note
 from robotid.dynamics.factors import Factors, merge
-from robotid.dynamics.prediction import predict
+from robotid.dynamics.torque import predict
 from robotid.estimation.fitting.recorded import LogPiece, SurveyedLog
 from robotid.estimation.work_plan import WorkPlan
 from robotid.robot.model import RobotModel

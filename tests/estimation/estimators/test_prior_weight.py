@@ -24,7 +24,7 @@ from robotid.estimation.estimators.consistent_fit import (
     plausible_weight,
 )
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.robot.geometry import body_boxes
+from robotid.robot.bodies import body_boxes
 
 
 @pytest.fixture
