@@ -32,7 +32,7 @@ from robotid.dynamics.torque import predict
 from robotid.robot.drive_term import DriveMotion
 from robotid.robot.drives import LoadFriction, Stribeck
 from robotid.robot.drives import AUTO
-from robotid.dynamics.simulation.truth import another_robot
+from robotid.dynamics.simulation.simulator import another_robot
 from robotid.dynamics.simulation.motions import random_fourier
 
 JOBS = Path(__file__).parents[1] / "tests" / "jobs"

@@ -239,10 +239,7 @@ def is_timely(log: Log, stated: float = 0.0) -> bool:
 
 @_once
 def velocity_lags(log: Log) -> tuple[float, Array]:
-    """Return the delay of measured velocities after the slopes of positions, and of each joint [s].
-
-    It minimises their distance on a uniform grid, refined by a parabola; 0 if the joints rest.
-    """
+    """Return the delay of measured velocities after the slopes of positions, and by joint [s]."""
     v = _measured(log)
     step = float(np.median(np.diff(log.t)))
     q = np.unwrap(log.q, axis=0)

@@ -259,7 +259,7 @@ def unpacked(value):
                 return {"low": value["low"], "step": value["step"], "codes": told_columns(value)}
             is_log = {"is_log": True} if "log" in value else {}
             return summary(numbers_of(value), _OF_CHART) | is_log
-        usual = {"faint": False, "hidden": False, "half": None, "marks": [], "logarithmic": "",
+        usual = {"is_weak": False, "is_hidden": False, "half": None, "marks": [], "logarithmic": "",
                  "x_names": [], "spans": []}  # fmt: skip
         if value.get("x_label") == "computing time [s]":
             value = {key: x for key, x in value.items() if key != "x"}

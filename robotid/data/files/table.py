@@ -14,10 +14,9 @@ from typing import Any, Protocol, TypeGuard
 import numpy as np
 
 from robotid.base.exceptions import DataError, MissingDependencyError, RobotIdError
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.typing import Array
 from robotid.data.files.columns import is_clock, named_by_row, quantity_of
-from robotid.data.log import suggestion
 from robotid.data.signal_settings import LogSource
 
 _CLOCK = "__time"  # PlotJuggler's

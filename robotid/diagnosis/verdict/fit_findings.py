@@ -22,8 +22,14 @@ from robotid.estimation.fitting.estimator_settings import BoundedSettings, Consi
 from robotid.estimation.fitting.fitted import Fit
 from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.estimation.variation.variation import UnlikeRun, Variation
-from robotid.robot.bodies import density_share, held_parameters, least_density, negligible_bodies
-from robotid.robot.geometry import body_boxes, body_points
+from robotid.robot.bodies import (
+    body_boxes,
+    body_points,
+    density_share,
+    held_parameters,
+    least_density,
+    negligible_bodies,
+)
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 

@@ -60,8 +60,7 @@ from robotid.estimation.variation.groups import (
     sums_of,
     with_zeros,
 )
-from robotid.robot.bodies import held_parameters, negligible_bodies
-from robotid.robot.geometry import body_boxes
+from robotid.robot.bodies import body_boxes, held_parameters, negligible_bodies
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 

@@ -20,8 +20,7 @@ from robotid.diagnosis.logs.check_logs import diagnose, findings_to_dict
 from robotid.diagnosis.urdf.inspection import inspect_urdf
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Sensors
-from robotid.dynamics.simulation.simulator import simulate
-from robotid.dynamics.simulation.truth import another_robot
+from robotid.dynamics.simulation.simulator import another_robot, simulate
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

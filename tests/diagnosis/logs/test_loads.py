@@ -19,7 +19,7 @@ from robotid.diagnosis.logs.hypotheses import (
     take_probe,
 )
 from robotid.diagnosis.logs.torque_checks import load_model
-from robotid.dynamics.simulation.truth import another_robot
+from robotid.dynamics.simulation.simulator import another_robot
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

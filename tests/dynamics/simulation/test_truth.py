@@ -9,7 +9,7 @@ from scipy.linalg import eigvalsh
 
 from robotid.base.exceptions import ModelError, SettingsError
 from robotid.dynamics.simulation.simulation_settings import Truth
-from robotid.dynamics.simulation.truth import draw_parameters, perturbed_bodies
+from robotid.dynamics.simulation.simulator import draw_parameters, perturbed_bodies
 from robotid.robot.drives import LoadFriction
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling, pseudo_inertia
