@@ -86,11 +86,6 @@ class Problem:
     sources: tuple[RowSource, ...] = ()  # the same rows joint by joint; empty: only blocks
     is_projected: bool = False  # whether constraint forces were eliminated, as of ``Factors``
 
-    def __post_init__(self) -> None:
-        wanted = (self.n_joints, len(self.names))
-        if self.support.shape != wanted:
-            raise DataError(f"support has shape {self.support.shape}, wanted {wanted}")
-
     def blocks(self) -> Iterator[Block]:
         """Yield the blocks (W (k n, c), tau (k n,), weight (k n,)) from the first one on."""
         return self.stream()
@@ -339,8 +334,6 @@ def gather(segments: Sequence[Factors], count: int) -> tuple[Factors, ...]:
 
 def join(reductions: Sequence[Reduction]) -> Reduction:
     """Return the reduction of all rows of several reductions."""
-    if not reductions:
-        raise DataError("there is no reduction, wanted that of at least one log")
     return Reduction(
         merge([r.factors for r in reductions]),
         np.sum([r.squares for r in reductions], axis=0),

@@ -217,9 +217,8 @@ def _forces(
     starts = [first for x, first in pairs if isinstance(x, Contact) and x.frame in names]
     if motion.wrenches is not None:
         b -= np.einsum("kmj,km->kj", J[:, known], motion.wrenches)
-    velocity = np.stack(
-        [np.einsum("kij,kj->ki", J[:, i : i + 3], motion.v) for i in starts], axis=1
-    )
+    speeds = np.einsum("kij,kj->ki", J, motion.v)
+    velocity = np.stack([speeds[:, i : i + 3] for i in starts], axis=1)
     J[:, known] = 0.0
     size = np.sqrt(np.mean(torque[:, :3] ** 2)) + 1e-9  # of any force, so that f is determined
     sigma = _noise_of_groups(J, b, size)

@@ -407,13 +407,12 @@ class _Loop:
         self.controller = _Torque(model, settings.controller, mass)
         share = settings.actuator.effort or 0.0
         urdf = [share * max(joint.effort, 0.0) or np.inf for joint in model.limits]
-        limits = by_joint(settings.actuator.limits, model.joints, "actuator: limits", np.nan)
-        self.limit = np.where(np.isnan(limits), urdf, limits)  # [N m or N]
+        stated = settings.actuator.limits
+        self.limit = by_joint(stated, model.joints, "actuator: limits", urdf)  # [N m or N]
         self.has_limits, self.n = bool(np.isfinite(self.limit).any()), len(model.joints)
         self.is_at_motor = settings.sensors.side == "motor"
-        self.gear = (
-            _Gear(plant, settings.actuator) if settings.actuator.stiffness is not None else None
-        )
+        actuator = settings.actuator
+        self.gear = None if actuator.stiffness is None else _Gear(plant, actuator)
         self.longest_step = self._longest_step()
 
     def start(self, q: Array, v: Array, a: Array) -> Array:
@@ -568,14 +567,9 @@ class _Torque:
         self.kind, self.w = settings.kind, settings.bandwidth
         self.nominal = RobotPlant(model, model.standard_parameters())
         inertia = np.maximum(mass.diagonal(), _LEAST_INERTIA)
-        stated = [
-            by_joint(x, model.joints, f"controller: {name}", np.nan)
-            for name, x in (("kp", settings.kp), ("kd", settings.kd))
-        ]
         default = inertia * self.w**2, 2 * inertia * self.w
-        self.kp, self.kd = (
-            np.where(np.isnan(x), y, x) for x, y in zip(stated, default, strict=True)
-        )
+        self.kp = by_joint(settings.kp, model.joints, "controller: kp", default[0])
+        self.kd = by_joint(settings.kd, model.joints, "controller: kd", default[1])
 
     def feedforward(self, q: Array, v: Array, a: Array) -> Array:
         """Return the feed-forward torque along a motion, shape (N, n)."""
