@@ -233,10 +233,9 @@ def _forces(
 
 
 def _noise_of_groups(J: Array, b: Array, size: float) -> Array:
-    """Return the noise level of rows, shape (n_rows,): one for forces, moments and joints each.
+    """Return the noise level of rows (n_rows,), of three groups, by restricted maximum likelihood.
 
-    Restricted maximum likelihood by Fisher scoring: Searle, Casella, McCulloch (1992), Variance
-    Components, 8.3. Reweighting by residuals over leverages needs tens of rounds.
+    See Searle, Casella, McCulloch (1992), Variance Components, 8.3 (Fisher scoring).
     """
     step, n = max(1, len(b) // _SAMPLES), b.shape[1]
     J, b, weak = J[::step], b[::step], np.eye(J.shape[1]) / (_WIDER * size) ** 2
@@ -314,11 +313,7 @@ def row_mask(model: RobotModel, trajectory: Trajectory, min_velocity: float) -> 
 
 
 def static_rows(model: RobotModel, log: Log, signals: SignalSettings) -> tuple[Trajectory, Array]:
-    """Return the samples of a log for a static model: rest phases and slow segments, one each.
-
-    At rest friction is anywhere within its limits: rest phases are used without it, and only for
-    joints that move in fewer samples than there are rest phases.
-    """
+    """Return the samples of a log for a static model: rest phases and slow segments, one each."""
     layout, n = model.layout, len(model.joints)
     unit, least = layout.drive_speeds[:n], min(signals.min_velocity, _MOVES)
     # inertial over gravity torque of a link of length l: a l / g and v^2 l / g
@@ -328,6 +323,7 @@ def static_rows(model: RobotModel, log: Log, signals: SignalSettings) -> tuple[T
         log, signals.max_gap or np.inf, least * unit, np.sqrt(largest) * size, largest * size
     )
     moves = sure_rows(layout, motion.v, least)
+    # at rest, friction is anywhere within its limits: it is left out, and part of the residual
     used = moves | (at_rest[:, None] & (moves.sum(axis=0) <= at_rest.sum()))
     signs, still = friction_directions(layout, motion.v, None), np.zeros_like(motion.v)
     return replace(motion, v=still, direction=signs if signs.shape[1] else None), used

@@ -35,9 +35,8 @@ _MOST_BYTES = 2**25  # of inertial columns that are stored with a trajectory
 
 _log = logging.getLogger(__name__)
 
-#: Work, samples times ``work_per_sample``, from which the compiled path is faster despite its start
-#: of about 0.5 s per process (importing Numba, reading the compiled code). For seven joints in
-#: series that is 1e5 samples. Compiling it takes some 10 s, once per installation.
+#: Samples times ``work_per_sample`` from which the compiled path is faster despite its start of
+#: 0.5 s per process: 1e5 samples of seven joints. Compiling takes 10 s, once per installation.
 LONG_ENOUGH = 3_500_000
 
 

@@ -55,9 +55,8 @@ def joint_torque_regressor(
 ) -> Array:
     """Return the regressor Y with tau = Y pi at each of N samples, shape (N n_rows, p).
 
-    Ten inertial columns of each body (Atkeson, An, Hollerbach 1986), then those of the drives:
-    ``tau_j = Ia a_j + Fv v_j + Fc sign(v_j) + off``. v and a (N, n_rows); None: directions (N, c)
-    are the signs of the speeds, internal states (N, m) steady ones.
+    Ten columns of each body (Atkeson, An, Hollerbach 1986), then those of the drives. None:
+    directions (N, c) are the signs of the speeds, internal states (N, m) steady ones.
     """
     wanted = (len(q), model.n_rows)
     if v.shape != wanted or a.shape != wanted:
@@ -165,13 +164,9 @@ def build_problem(
 
 
 def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) -> Array:
-    """Return the regressor at random states, shape (N n_rows, p), for structural properties.
-
-    With speeds sqrt(g / length) and accelerations g / length, gravity over inertia is the same for
-    a finger and a crane. Loops are closed, and their forces eliminated.
-    """
+    """Return the regressor at random states, (N n_rows, p); loops closed, without their forces."""
     n = len(model.joints)
-    rate = np.sqrt(9.81 / model.length)  # [1/s]
+    rate = np.sqrt(9.81 / model.length)  # [1/s]: gravity counts the same for finger and crane
     size = np.array([model.length if j.type == "prismatic" else np.pi for j in model.limits])
     q = rng.uniform(-1, 1, (samples, n)) * size
     unit = np.minimum(size, 1.0)  # [rad or m]
@@ -234,16 +229,14 @@ def predict(
     *,
     compiled: bool | None = None,
 ) -> list[Array]:
-    """Return the torque W theta, (N, n_rows) [N m, N], of several vectors; constrained: P W theta.
-
-    By rows for all together, or, not compiled and few, by inverse dynamics for each (Luh 1980).
-    """
+    """Return the torque W theta, (N, n_rows) [N m, N], of each vector; constrained: P W theta."""
     source = trajectory_rows(model, trajectory, None, compiled)
     stacked = np.column_stack(list(parameters))
     few = len(parameters) * (_START + model.pin_model.nv) <= work_per_sample(model)
     if source.inertial is not None:
         torques = _from_kept(source, source.inertial, stacked)
     elif source.engine != COMPILED and few and all(_has_centres(model, pi) for pi in parameters):
+        # Luh, Walker, Paul (1980)
         torques = [inverse_dynamics(model, pi, trajectory) for pi in parameters]
     else:
         torques = _from_rows(source, stacked)

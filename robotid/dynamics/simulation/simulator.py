@@ -45,7 +45,8 @@ _SIGN_SPEED = 2e-4  # speed over which the plant's Coulomb friction reverses [ra
 _TYPICAL_EFFORT = 50.0  # effort limit of a drive with typical parameters [N m or N]
 _IMPOSSIBLE = -1e-9  # smallest eigenvalue of a body's pseudo-inertia over the largest
 
-# ROS34PW2, a Rosenbrock W-method: order 3 for any Jacobian approximation, L-stable
+# ROS34PW2, a Rosenbrock W-method: order 3 for any Jacobian approximation, L-stable, stable with
+# stiction (Rang, Angermann 2005, New Rosenbrock W-methods)
 _GAMMA = 4.3586652150845900e-01
 _ALPHA = np.zeros((4, 4))
 _ALPHA[1, 0] = 8.7173304301691801e-01
@@ -100,11 +101,7 @@ def follow(
     settings: Simulation,
     progress: ProgressCallback = ignore_progress,
 ) -> Run:
-    """Return the exact motion of a robot, a ``RobotPlant``, that tracks a motion.
-
-    With elastic gears, rotor and friction are on the motor's side. The Rosenbrock W-method of order
-    3 is stable with stiction (Rang, Angermann 2005, New Rosenbrock W-methods).
-    """
+    """Return the exact motion of a plant that tracks a motion; friction is on the motor's side."""
     _check_size(duration * rate, 1)
     t = np.arange(round(duration * rate) + 1) / rate
     loaded = carried(model, pi, settings.payload)
@@ -247,9 +244,8 @@ class Friction:
 class RobotPlant:
     """The plant M(q) a + b(q, v) + Ia a + Fv v + Fc sign(v) + off = u of a robot.
 
-    The drives have the terms of the model; sign(v) is tanh(v / 0.2 mm/s). Load-dependent friction
-    uses the load of the same instant. The bristle deflection z is a state with ``bristle_rate``; if
-    it is not given, sliding is steady. A ``Lag`` is one of the measurement. q, v, u (n,), pi (p,).
+    sign(v) is tanh(v / 0.2 mm/s). Load-dependent friction uses the load of the same instant. The
+    bristle deflection z is a state; not given: steady. A ``Lag`` is one of the measurement.
     """
 
     def __init__(self, model: RobotModel, pi: Array) -> None:
