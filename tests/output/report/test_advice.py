@@ -204,7 +204,8 @@ def test_an_error_comes_before_a_warning_and_three_steps_are_enough(identified):
 SETTINGS = {
     "current_for_torque": ([{}], "[torque.gains]\nelbow_joint = GAIN", "--gain elbow_joint=GAIN"),
     "torque_delay": (
-        [{"delay": 0.0041}, {"delay": 0.0061}], "[signals]\ntorque_delay = 0.0051", "--torque-delay 0.0051"
+        [{"delay": 0.0041}, {"delay": 0.0061}], "[signals]\ntorque_delay = 0.0051",
+        "--torque-delay 0.0051",
     ),
 }  # fmt: skip
 
