@@ -318,9 +318,19 @@ def identify_job(
     """Identify from a job's logs; nothing is written."""
     check_ignored(job.ignore)
     report_stage(plan.progress, "reading logs", _stages(job.estimator))
-    if isinstance(job.estimator, SimulationSettings):
-        return _identify_loops(job, model, plan.progress)
     groups = job.identification, job.validation
+    if isinstance(job.estimator, SimulationSettings):
+        from robotid.identification.closed_loop.from_commands import identify_loops
+
+        needs = needed_of(job.controller)
+        logs, held_out = ([job.read(x, model, needs=needs) for x in entries] for entries in groups)
+        identification = identify_loops(
+            model, logs, held_out, job.controller, job.estimator, signals=job.signals,
+            chooses=AUTO in job.terms, examined=diagnose(model, logs, held_out, job.signals),
+            ignore=job.ignore, units=units_of_logs(job.identification),
+            progress=plan.progress or ignore_progress,
+        )  # fmt: skip
+        return replace(identification, stated=replace(identification.stated, job=job))
     fitted, validation = survey_logs(job, model, *groups, refuse=refuse)
     if not fitted:
         which = "no log is usable" if job.identification else "no log is given"
@@ -343,12 +353,9 @@ def identify_job(
             recordings, job.estimator, findings, job.ignore, friction=job.friction,
             progress=plan.progress,
         )  # fmt: skip
-    return replace(
-        concluded,
-        stated=replace(concluded.stated, job=job),
-        findings=(*notes, *concluded.findings),
-        payload_checks=check_payloads(job, concluded.model, fitted),
-    )
+    checks = check_payloads(job, concluded.model, fitted)
+    stated, noted = replace(concluded.stated, job=job), (*notes, *concluded.findings)
+    return replace(concluded, stated=stated, findings=noted, payload_checks=checks)
 
 
 def _stages(choice: EstimatorSettings) -> Sequence[str]:
@@ -358,26 +365,6 @@ def _stages(choice: EstimatorSettings) -> Sequence[str]:
     from robotid.identification.closed_loop import stages
 
     return stages.STAGES
-
-
-def _identify_loops(
-    job: Job, model: RobotModel, progress: ProgressCallback | None
-) -> Identification:
-    """Identify by simulation, from commands or logged torques."""
-    from robotid.identification.closed_loop.from_commands import identify_loops
-
-    assert isinstance(job.estimator, SimulationSettings)
-    logs, validation = (
-        [job.read(entry, model, needs=needed_of(job.controller)) for entry in entries]
-        for entries in (job.identification, job.validation)
-    )
-    identification = identify_loops(
-        model, logs, validation, job.controller, job.estimator, signals=job.signals,
-        chooses=AUTO in job.terms, examined=diagnose(model, logs, validation, job.signals),
-        ignore=job.ignore, units=units_of_logs(job.identification),
-        progress=progress or ignore_progress,
-    )  # fmt: skip
-    return replace(identification, stated=replace(identification.stated, job=job))
 
 
 MAIN_FLAGS = (

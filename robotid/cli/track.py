@@ -26,10 +26,8 @@ def run_track(job: Job, folder: str | Path) -> dict[str, Any]:
     check_folder(target, [history, "track.json"], [job.urdf, entry.path])
     log = job.read(entry, model)
     if job.signals.cutoff is None:
-        raise SettingsError(
-            "the cutoff is disabled, but the online estimator differentiates positions; state a "
-            "cutoff in Hz"
-        )
+        words = "the cutoff is disabled, but the online estimator differentiates positions"
+        raise SettingsError(f"{words}; state a cutoff in Hz")
     rate = job.signals.rate or 1.0 / float(np.median(np.diff(log.t)))
     cutoff, slowest = job.signals.cutoff, job.signals.min_velocity
     settings = OnlineSettings(rate=rate, cutoff=cutoff, min_velocity=slowest)
@@ -43,9 +41,9 @@ def run_track(job: Job, folder: str | Path) -> dict[str, Any]:
 
 
 def _summary(tracked: Track, job: Job, log: Log, history: str) -> dict[str, Any]:
-    identifier = tracked.identifier
+    identifier, last = tracked.identifier, tracked.identifier.reading
     model, mapping = identifier.model, identifier.mapping
-    pairs, last = zip(tracked.t.tolist(), tracked.readings, strict=True), identifier.reading
+    pairs = zip(tracked.t.tolist(), tracked.readings, strict=True)
     converged = [t for t, reading in pairs if reading.converged]
     units = [model.layout.units[i] for i in mapping.independent]
     rows = zip(mapping.base_names, mapping.expressions, last.theta.tolist(),
