@@ -401,10 +401,10 @@ def run(options: argparse.Namespace) -> int:
 
 
 def show_result(
-    result: dict[str, Any], *, findings: Sequence[Finding] = (), is_verbose: bool = False
+    result: dict[str, Any], findings: Sequence[Finding], *, is_verbose: bool = False
 ) -> None:
-    width, wls = terminal_width(), result.get("wls")
-    echo(f"\n{result['robot']}: {len(result['joints'])} joints, {_found(result)}")
+    width, wls, verdict = terminal_width(), result.get("wls"), result["verdict"]
+    echo(f"\n{result['robot']}: {len(result['joints'])} joints, {_structure_words(result)}")
     roles = ("identification", "validation")
     fitted, validation = (recordings_of(result["inputs"], role) for role in roles)
     echo(f"\nfitted: {', '.join(fitted)}", "  ")
@@ -415,16 +415,14 @@ def show_result(
     if lines := _drive_lines(result):
         print("\n" + "\n".join(wrapped(line, width, "  ") for line in lines))
     print()
-    verdict = result["verdict"]
     print_causes(
-        findings or [Finding(**entry) for entry in result["warnings"]], result["joints"],
-        is_verbose=is_verbose, worst="" if verdict["status"] == "good" else _worst(result),
-        printed=verdict["reasons"],
+        findings, result["joints"], is_verbose=is_verbose, printed=verdict["reasons"],
+        worst="" if verdict["status"] == "good" else _worst(result),
     )  # fmt: skip
     print_verdict(verdict)
 
 
-def _found(result: Mapping[str, Any]) -> str:
+def _structure_words(result: Mapping[str, Any]) -> str:
     """Return the number of parameters and their conditioning, as text."""
     if "simulation" in result:
         from robotid.identification.closed_loop.position_errors import DRIFTS  # imports numpy
