@@ -135,6 +135,17 @@ def test_a_simulation_finds_in_memory_what_a_job_finds_of_the_same_logs(tmp_path
         assert (entry["start"], entry["end"]) == pytest.approx((log.t[0], log.t[-1]), abs=1e-6)
 
 
+def test_a_simulation_selects_friction_that_is_not_stated(arm, arm_logs, monkeypatch):
+    place, chooses = "robotid.identification.closed_loop.from_commands.identify_loops", []
+    monkeypatch.setattr(place, lambda *_, **stated: chooses.append(stated["chooses"]))
+    for friction in ("auto", "viscous+coulomb"):
+        robotid.identify(
+            arm, arm_logs / "fit.csv", estimator="simulation", controller={"kind": "torque"},
+            friction=friction, doctor=False,
+        )  # fmt: skip
+    assert chooses == [True, False]
+
+
 def test_a_job_file_and_its_settings_in_python_find_the_same(arm, arm_logs, tmp_path):
     urdf, log, job = arm.tree.path, arm_logs / "fit.csv", tmp_path / "job.toml"
     job.write_text(
