@@ -9,7 +9,7 @@ from string import Formatter
 import pytest
 from helpers.paths import ROOT
 
-from robotid.base.findings import Finding, by_severity, grouped, listed, toml_key
+from robotid.base.findings import Finding, by_severity, grouped, listed, sentence, toml_key
 from robotid.base.text import columns, command_lines, in_digits_of, period, tinted, wrapped
 from robotid.diagnosis.catalogue import entries, finding, reason_of, step_of
 
@@ -159,6 +159,14 @@ def test_a_finding_has_its_subject_its_figures_and_its_sentence():
     assert reason_of(slow) == (
         "the torque is delayed by -0.002 s relative to the position (negative: early)"
     )
+
+
+def test_of_several_numbers_a_sentence_has_the_range_or_the_one_that_its_slot_asks_for():
+    fault = "{x:.1f} m, {x!l:.0f}, {x!h:.0f}, {x!w:.0f}, type {x!t:.0f}"
+    sizes = (3.0, 1.0, 4.0, 2.0)
+    some = [Finding("a", "note", "b", "", {"x": x}, "log", fault=fault) for x in sizes]
+    assert sentence(some) == "log: 1.0 to 4.0 m, 1, 4, 4, type 2"
+    assert sentence(some[:1]) == "log: 3.0 m, 3, 3, 3, type 3"
 
 
 def still(log, joint, size, severity="warning"):

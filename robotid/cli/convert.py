@@ -7,14 +7,14 @@ from typing import Any
 
 from robotid.base.exceptions import DataError
 from robotid.base.files import check_file
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.cli.console import echo, show_found
 from robotid.cli.job import JOB, SOURCE, add_shown
 from robotid.data.base_motion import ACCELERATION, IMU, POSE, TWIST
 from robotid.data.files.columns import KINDS, is_clock, quantity_of
 from robotid.data.files.read import open_table, write_columns
 from robotid.data.files.table import with_even_stamps
-from robotid.data.log import repeated, suggestion
+from robotid.data.log import repeated
 from robotid.data.signal_settings import LogSource
 from robotid.robot.constraints import Contact
 

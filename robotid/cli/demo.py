@@ -15,8 +15,7 @@ from robotid.data.files.read import write_log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Noise, Truth
-from robotid.dynamics.simulation.simulator import simulate
-from robotid.dynamics.simulation.truth import draw_parameters
+from robotid.dynamics.simulation.simulator import draw_parameters, simulate
 from robotid.estimation.work_plan import WorkPlan
 from robotid.identification.result import TorqueIdentification
 from robotid.robot.examples import example_urdf

@@ -18,7 +18,7 @@ from robotid.cli.job import JOB, ROBOT, Flags, Job, add_shown, as_job, job_from_
 from robotid.cli.logs import result_run
 from robotid.data.log import Log
 from robotid.design.clearance import Box, Clearance
-from robotid.design.design import Design, Designer, FourierBasis
+from robotid.design.design import Design, Designer, FourierBasis, design_stands, design_sweeps
 from robotid.design.excitation import (
     FARTHEST,
     ROUTES,
@@ -28,7 +28,6 @@ from robotid.design.excitation import (
 )
 from robotid.design.limits import LIMITS, Course, MotionLimits
 from robotid.design.previews import Preview, Run, preview_logs
-from robotid.design.routes import design_stands, design_sweeps
 from robotid.estimation.fitting.recorded import hold_log
 from robotid.output.report.motion_page import write_motion_page
 from robotid.robot.model import RobotModel

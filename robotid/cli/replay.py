@@ -29,8 +29,8 @@ from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource
 from robotid.design.clearance import Clearance
 from robotid.design.limits import LIMITS, Course, MotionLimits
-from robotid.dynamics.prediction import predict, predict_instants
 from robotid.dynamics.prepared_logs import closed_log
+from robotid.dynamics.torque import predict, predict_instants
 from robotid.estimation.fitting.recorded import hold_log
 from robotid.identification.result import TorqueIdentification
 from robotid.output.files.result_file import (

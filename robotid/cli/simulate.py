@@ -30,8 +30,14 @@ from robotid.data.signals import process
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.motions import SampledMotion
 from robotid.dynamics.simulation.simulation_settings import Simulation, read_simulation
-from robotid.dynamics.simulation.simulator import Run, carried, delay, follow, measure
-from robotid.dynamics.simulation.truth import draw_parameters
+from robotid.dynamics.simulation.simulator import (
+    Run,
+    carried,
+    delay,
+    draw_parameters,
+    follow,
+    measure,
+)
 from robotid.output.files.result_file import SCHEMA_VERSION
 from robotid.output.files.urdf import write_urdf
 from robotid.robot.model import RobotModel

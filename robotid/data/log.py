@@ -1,9 +1,8 @@
 """Motion of a robot as arrays: `Log`, the recording, and `Trajectory`, the input of a fit."""
 
-import difflib
 import tempfile
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.settings import is_number, require_each, require_flag, require_kind
 from robotid.base.text import seconds
 from robotid.base.typing import Array, frozen, real_numbers
@@ -144,16 +143,7 @@ class Log:
             is_end = isinstance(limit, float | np.floating) and bool(np.isinf(limit))
             if not (limit is None or is_end or is_number(limit)):
                 raise DataError(f"{name} is {str(limit)[:60]!r}, wanted a time [s], or None")
-        first = self.t[0] if start is None else start
-        last = self.t[-1] if end is None else end
-        rows = np.flatnonzero((self.t >= first) & (self.t <= last))
-        if len(rows) < 2:
-            raise DataError(
-                f"{self.name}: {len(rows)} rows lie between {seconds(first)} s and {seconds(last)} "
-                f"s; the log spans {seconds(self.t[0])} s to {seconds(self.t[-1])} s. Choose start "
-                "and end inside it"
-            )
-        within = slice(rows[0], rows[-1] + 1)
+        within = slice(*rows_within(self.t, self.name, start, end))
         return replace(
             self,
             t=self.t[within],
@@ -327,10 +317,20 @@ class Trajectory:
         return some
 
 
-def suggestion(name: str, known: Collection[str]) -> str:
-    """Return ". Did you mean 'x'?" for the most similar known name, or "" if none is similar."""
-    near = difflib.get_close_matches(name, known, n=1)
-    return f". Did you mean {near[0]!r}?" if near else ""
+def rows_within(
+    t: Array, name: str, start: float | None = None, end: float | None = None
+) -> tuple[int, int]:
+    """Return the first row from start to end [s] and the row after the last, both included."""
+    first = 0 if start is None else int(np.searchsorted(t, start))
+    stop = len(t) if end is None else int(np.searchsorted(t, end, side="right"))
+    if stop - first < 2:
+        low, high = t[0] if start is None else start, t[-1] if end is None else end
+        raise DataError(
+            f"{name}: {max(stop - first, 0)} rows lie between {seconds(low)} s and {seconds(high)} "
+            f"s; the log spans {seconds(t[0])} s to {seconds(t[-1])} s. Choose start and end "
+            "inside it"
+        )
+    return first, stop
 
 
 def repeated(names: Sequence[str]) -> list[str]:

@@ -23,23 +23,27 @@ from typing import Any
 import numpy as np
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.settings import SIZE, is_number, require_kind
 from robotid.base.typing import Array
 from robotid.data.files.read import Readable
-from robotid.data.log import Log, suggestion
+from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import low_pass
 from robotid.diagnosis.logs.check_logs import excitation_finding
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.factors import Factors, compress, join, merge
-from robotid.dynamics.prediction import predict, predict_instants
 from robotid.dynamics.prepared_logs import base_problem, independent_share
+from robotid.dynamics.torque import predict, predict_instants
 from robotid.estimation.estimators import Estimate
 from robotid.estimation.estimators.batch import solve_factor
 from robotid.estimation.estimators.determination import base_spread, determine
 from robotid.estimation.estimators.estimator import FEWEST_SEGMENTS, scatter
-from robotid.estimation.fitting.estimator_settings import ConsistentSettings, EstimatorSettings
+from robotid.estimation.fitting.estimator_settings import (
+    ConsistentSettings,
+    EstimatorSettings,
+    OLSSettings,
+)
 from robotid.estimation.fitting.evaluation import evaluate_logs
 from robotid.estimation.fitting.fit import Known, consistent_fit, pinned_links
 from robotid.estimation.fitting.fitted import expected_band
@@ -486,7 +490,7 @@ def _errors(
         for sigma in (information.sigma, np.ones_like(information.sigma))
     )
     if not isinstance(choice, ConsistentSettings):
-        return (alike if choice.has_equal_weights else plain), plain
+        return (alike if isinstance(choice, OLSSettings) else plain), plain
     stated = choice.prior_weight
     weight, plausible = typical if isinstance(stated, str) else (stated, 1.0)
     bounds = {**choice.constraints, "extent": "none"}

@@ -12,8 +12,7 @@ import scipy.linalg
 
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
-from robotid.dynamics.factors import triangle_of
-from robotid.dynamics.problem import Problem
+from robotid.dynamics.factors import Problem, triangle_of
 from robotid.dynamics.torque import random_regressor
 from robotid.robot.model import RobotModel
 

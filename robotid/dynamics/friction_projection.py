@@ -16,7 +16,7 @@ import numpy as np
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
-from robotid.dynamics.prediction import drive_motion_along
+from robotid.dynamics.torque import drive_motion_along
 from robotid.robot.drive_term import DriveTerm
 from robotid.robot.drives import TERMS, Lag, LuGre, Presliding, Spring
 from robotid.robot.model import RobotModel, pinocchio_model

@@ -27,10 +27,9 @@ from robotid.data.signals import process, standing_motion
 from robotid.data.units import coarse_velocities, is_timely, unlike_velocities
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.constraint_rows import constraint_jacobian, measured_rows
-from robotid.dynamics.prediction import predict
-from robotid.dynamics.problem import Problem
+from robotid.dynamics.factors import Problem
 from robotid.dynamics.rows import friction_directions, friction_speeds, sure_rows
-from robotid.dynamics.torque import build_problem, joint_torque_regressor
+from robotid.dynamics.torque import build_problem, joint_torque_regressor, predict
 from robotid.robot.closure import Chains
 from robotid.robot.constraints import Contact, frame_id, link_positions
 from robotid.robot.model import RobotModel

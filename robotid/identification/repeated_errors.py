@@ -36,8 +36,8 @@ from robotid.data.log import Trajectory
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.constraint_rows import constraint_forces, contact_links, without_forces
 from robotid.dynamics.factors import Triangle, join, triangle_of
-from robotid.dynamics.prediction import predict
 from robotid.dynamics.prepared_logs import base_problem
+from robotid.dynamics.torque import predict
 from robotid.estimation.estimators import WLS
 from robotid.estimation.fitting.recorded import Recordings, RepeatedErrors, Rows
 from robotid.robot.constraints import Contact
@@ -79,8 +79,8 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
             rows = replace(rows, trajectory=rows.trajectory.every(step), mask=rows.mask[::step])
             D, first = _slopes(model, rows, pi, points), 0
             if d:
-                has_imu = frame is not None
-                D = np.column_stack([D, has_imu * _slopes_of_bias(model, rows, pi)])
+                of_bias = (frame is not None) * _slopes_of_bias(model, rows, pi)
+                D = np.column_stack([D, of_bias])
             if frame is not None:
                 pushed.append(_world_acceleration(rows.trajectory, biases[0]))
                 segments.append(rows.trajectory.segment)
@@ -94,32 +94,25 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
     if not whole.factors.rows[6 * model.free_flyer :].any():
         stated = [_MOST if each is None else each for each in stated]
     size = float(np.sqrt(np.mean(np.square(drifts)))) if drifts else 0.0
-    before = np.zeros(c + d) if not d else np.append(np.zeros(c), -biases[0])
+    before = np.concatenate([np.zeros(c), *(-x for x in biases[:1])])
     sizes = np.append(np.repeat(np.array(stated, dtype=float), 3), np.full(d, size))
     count = int(whole.factors.rows.sum())
     L = np.linalg.cholesky((mapping.K * spread**2) @ mapping.K.T)
     fit = estimated_errors(total.R, L, mean, recordings.share, count, sizes, before)
-    cross = total.R[:b, :b].T @ total.R[:b, b:-1]  # -W^T D
     roots = _roots(fit, sizes, c)
-    rest = total.R[b:-1, b:-1] @ roots  # of D, what W cannot explain
-    variance = float(np.sum(rest**2)) / count
+    rest = np.sum((total.R[b:-1, b:-1] @ roots) ** 2)  # of D, what W cannot explain
     largest = float(np.where(np.isnan(sizes), fit.size, sizes)[:c].max(initial=0.0))
-    root = np.column_stack([cross @ roots, shift])
-    errors = RepeatedErrors(root, variance, largest, has_motion=is_blind)
+    root = np.column_stack([total.R[:b, :b].T @ total.R[:b, b:-1] @ roots, shift])  # -W^T D
+    errors = RepeatedErrors(root, float(rest) / count, largest, has_motion=is_blind)
     if not d:
         return replace(recordings, repeated=errors)
-    bias = biases[0] + fit.known[c:]
-    error = float(np.sqrt(np.mean(np.diag(fit.covariance)[c:])))
-    return _without_bias(recordings, replace(errors, bias=bias, bias_error=error), bias)
-
-
-def _without_bias(recordings: Recordings, errors: RepeatedErrors, bias: Array) -> Recordings:
-    """Return recordings with their errors, without the bias (3,) of accelerometers [m/s^2]."""
-    fitted, validation = (
+    bias, variance = biases[0] + fit.known[c:], np.mean(np.diag(fit.covariance)[c:])
+    errors = replace(errors, bias=bias, bias_error=float(np.sqrt(variance)))
+    fitted, held_out = (
         [log.with_accelerometer_bias(bias) for log in logs]
         for logs in (recordings.fitted, recordings.validation)
     )
-    return replace(recordings, repeated=errors, fitted=fitted, validation=validation)
+    return replace(recordings, repeated=errors, fitted=fitted, validation=held_out)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from robotid.cli.identify import identify, run_job
 from robotid.cli.job import job_from_settings
 from robotid.data.files.read import read_log, write_log
 from robotid.data.signal_settings import SignalSettings
-from robotid.dynamics.prediction import predict
+from robotid.dynamics.torque import predict
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.output.files.urdf import load_identified, write_urdf
 from robotid.robot.examples import example_urdf

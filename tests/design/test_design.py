@@ -112,14 +112,15 @@ def test_a_search_near_the_limits_continues_beyond_them_and_a_stalled_one_restar
 def test_what_is_known_already_is_not_asked_for_again(designer, design):
     rows = designer.information.rows(*(design.motion.evaluate(np.linspace(0, 4.0, 61))))
     told = designer.matrix(rows)
-    next_one = replace(designer, given=told)
+    next_one = replace(designer, known=told)
     again = next_one._objective(design.motion.coefficients)
     fresh = next_one.design(np.random.default_rng(4), starts=1)
     assert fresh.objective < again - 0.02
     # its condition is that of the motion itself, without what was known before
-    own = designer.used_and_informed(fresh.motion, 4.0, fresh.intervals / 4.0)[1] - np.eye(
-        len(told)
+    rows = designer.information.rows(
+        *fresh.motion.evaluate(np.linspace(0, 4.0, fresh.intervals + 1))
     )
+    own = designer.matrix(rows, 4.0 / fresh.intervals) - np.eye(len(told))
     assert fresh.condition == pytest.approx(np.sqrt(np.linalg.cond(own)), rel=1e-6)
 
 
@@ -139,7 +140,7 @@ def test_an_earlier_run_is_known_with_its_own_noise_in_units_of_the_spread(wrist
 def test_a_motion_after_another_narrows_what_that_one_left_wide(designer, design):
     rows = designer.information.rows(*(design.motion.evaluate(np.linspace(0, 4.0, 61))))
     told = designer.matrix(rows)
-    after = replace(designer, given=told, name="widest")
+    after = replace(designer, known=told, name="widest")
     before = np.diag(np.linalg.inv(told))
     widest = after.widest
     assert len(widest) == round(len(told) / 4)

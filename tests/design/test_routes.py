@@ -1,11 +1,18 @@
 import numpy as np
 import pytest
 
-from robotid.design import routes
+from robotid.design import design as designs
 from robotid.design.clearance import Clearance
-from robotid.design.design import Designer, FourierBasis
+from robotid.design.design import (
+    _PLACES,
+    Designer,
+    FourierBasis,
+    Route,
+    _free_range,
+    design_stands,
+    design_sweeps,
+)
 from robotid.design.limits import LIMITS, MotionLimits
-from robotid.design.routes import _PLACES, Route, _free_range, design_stands, design_sweeps
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -73,7 +80,7 @@ def test_sweeps_beyond_a_limit_are_each_a_fifth_shorter(designer, monkeypatch):
     spans = []
     for attempts in (1, 3):
         results = iter([False] * (attempts - 1) + [True])
-        monkeypatch.setattr(routes, "_is_feasible", lambda _, verdicts=results: next(verdicts))
+        monkeypatch.setattr(designs, "_is_feasible", lambda _, verdicts=results: next(verdicts))
         design = design_sweeps(designer, np.random.default_rng(0), speeds=(0.8,))
         spans.append(np.ptp(design.motion.places, axis=0))
     assert (spans[1] / spans[0]).min() == pytest.approx(0.64)

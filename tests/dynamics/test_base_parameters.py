@@ -70,15 +70,6 @@ def test_armature_adds_what_the_literature_says(ur5, panda):
         assert len(structural_mapping(arm).K) == expected
 
 
-def test_base_parameters_carry_all_the_torque(panda, rng):
-    mapping = structural_mapping(panda)
-    W = random_regressor(panda, 40, rng)  # states that the mapping never saw
-    pi = panda.standard_parameters() + rng.standard_normal(len(panda.layout.names))
-    tau = W @ pi
-    error = np.abs(W[:, mapping.independent] @ mapping.to_base(pi) - tau).max()
-    assert error < 1e-11 * np.abs(tau).max()
-
-
 def test_standard_parameters_come_back_from_base_ones(panda, rng):
     mapping = structural_mapping(panda)
     prior = panda.standard_parameters()
@@ -157,9 +148,6 @@ def test_pivots_are_shares_of_the_largest_whatever_the_unit(rng):
         assert found.K.shape == (4, 5)
         pi = rng.standard_normal(5)
         np.testing.assert_allclose(W[:, found.independent] @ (found.K @ pi), W @ pi, atol=1e-9)
-        spread = np.array([2.0, 0.5, 1.0, 3.0, 0.1])
-        G = np.diag(spread**2) @ found.K.T @ np.linalg.inv(found.K @ np.diag(spread**2) @ found.K.T)
-        np.testing.assert_allclose(found.gain(spread), G, atol=1e-9)
 
 
 def test_further_terms_that_are_multiples_of_each_other_are_one_base_parameter(rng):

@@ -20,8 +20,7 @@ from robotid.dynamics.constraint_rows import (
     without_forces,
 )
 from robotid.dynamics.factors import compress, compress_segments, merge
-from robotid.dynamics.prediction import predict
-from robotid.dynamics.torque import build_problem, joint_torque_regressor
+from robotid.dynamics.torque import build_problem, joint_torque_regressor, predict
 from robotid.robot.constraints import Contact, Loop
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -49,6 +48,11 @@ def random_motion(model, rng, samples):
     n = len(model.joints)
     q = np.hstack([pose, rng.uniform(-1, 1, (samples, n))])
     return q, *rng.standard_normal((2, samples, 6 + n))
+
+
+def trajectory(model, q, v, a, **more):
+    values = {"tau": 0 * v, "rate": None, "segment": np.zeros(len(q), dtype=int)} | more
+    return Trajectory(t=np.arange(float(len(q))), q=q, v=v, a=a, joints=model.joints, **values)
 
 
 def moved(model, q, speed, step):
@@ -127,11 +131,8 @@ def test_unknown_forces_have_no_effect_and_measured_ones_are_subtracted(
     J, f = constraint_jacobian(quadruped, q, touching), rng.standard_normal((7, 15))
     tau = rigid - np.einsum("kmj,km->kj", J, f)
     measured = [11, 12]  # fz and mx of the last foot
-    motion = Trajectory(
-        t=np.arange(7.0), q=q, v=v, a=a, tau=tau, joints=quadruped.joints, rate=None,
-        segment=np.zeros(7, dtype=int), contacts=flags, wrenches=f[:, measured],
-        switching=np.arange(7) == 4,
-    )  # fmt: skip
+    known = {"contacts": flags, "wrenches": f[:, measured], "switching": np.arange(7) == 4}
+    motion = trajectory(quadruped, q, v, a, tau=tau, **known)
     found, used = constrained(quadruped, motion, np.ones((7, 18), dtype=bool))
     (predicted,) = predict(quadruped, [pi], found)
     with pytest.raises(DataError, match="has contact flags of 4 contacts, wanted 3, one for each"):
@@ -158,10 +159,8 @@ def test_forces_are_those_of_least_squares_over_the_rows_used(quadruped, rng):
     q, v, a = random_motion(quadruped, rng, 3)
     flags = np.array([[1, 0, 1], [1, 1, 0], [0, 0, 1]], dtype=bool)
     torque, tau, projected = rng.normal(size=(3, 3, 18))
-    motion = Trajectory(
-        t=np.arange(3.0), q=q, v=v, a=a, tau=tau, joints=quadruped.joints, rate=None,
-        segment=np.zeros(3, dtype=int), contacts=flags, wrenches=rng.normal(size=(3, 2)),
-    )  # fmt: skip
+    wrenches = rng.normal(size=(3, 2))
+    motion = trajectory(quadruped, q, v, a, tau=tau, contacts=flags, wrenches=wrenches)
     used = rng.random((3, 18)) < 0.8
     J = constraint_jacobian(quadruped, q, np.column_stack([flags, np.ones(3, dtype=bool)]))
     for own in (motion, replace(motion, basis=np.zeros((3, 18, 1)), tau=projected, loaded=tau)):
@@ -187,11 +186,8 @@ def test_links_of_contacts_have_their_axes_and_turn_in_the_world(quadruped, rng)
 
 def test_without_torque_only_rows_of_the_base_are_used(quadruped, rng):
     q, v, a = random_motion(quadruped, rng, 2)
-    motion = Trajectory(
-        t=np.arange(2.0), q=q, v=v, a=a, tau=0 * v, joints=quadruped.joints, rate=None,
-        segment=np.zeros(2, dtype=int), contacts=np.zeros((2, 3), dtype=bool),
-        wrenches=np.zeros((2, 2)),
-    )  # fmt: skip
+    air = {"contacts": np.zeros((2, 3), dtype=bool), "wrenches": np.zeros((2, 2))}
+    motion = trajectory(quadruped, q, v, a, **air)
     found, used = constrained(quadruped, motion, np.ones((2, 18), dtype=bool), has_torque=False)
     assert used.tolist() == [[True] * 6 + [False] * 12] * 2
     assert not found.basis[:, 6:].any()  # a force on the base may not act through a joint
@@ -203,11 +199,9 @@ def test_rows_are_projected_and_counted(quadruped, rng):
     q, v, a = random_motion(quadruped, rng, 40)
     weight = rng.uniform(0.5, 2.0, (40, 18)) * (rng.random((40, 18)) < 0.9)
     weight[:, 9] = 0.0  # its torque is projected into other rows
-    motion = Trajectory(
-        t=np.arange(40.0), q=q, v=v, a=a, tau=rng.standard_normal((40, 18)),
-        joints=quadruped.joints, rate=None, segment=np.zeros(40, dtype=int),
-        contacts=rng.random((40, 3)) < 0.5, switching=np.zeros(40, dtype=bool),
-        wrenches=rng.standard_normal((40, 2)),
+    motion = trajectory(
+        quadruped, q, v, a, tau=rng.standard_normal((40, 18)), contacts=rng.random((40, 3)) < 0.5,
+        switching=np.zeros(40, dtype=bool), wrenches=rng.standard_normal((40, 2)),
     )  # fmt: skip
     found, used = constrained(quadruped, motion, np.ones((40, 18), dtype=bool))
     problem = build_problem(quadruped, found, used * weight)

@@ -6,14 +6,15 @@ from robotid.base.exceptions import DataError
 from robotid.data.log import Trajectory
 from robotid.dynamics import factors
 from robotid.dynamics.factors import (
+    Problem,
     Reduction,
     compress,
     compress_segments,
+    concatenate,
     gather,
     join_segments,
     merge,
 )
-from robotid.dynamics.problem import Problem, concatenate
 from robotid.dynamics.torque import build_problem
 
 

@@ -10,8 +10,7 @@ from helpers.robots import motion
 from robotid.base.exceptions import DataError
 from robotid.data.log import Trajectory
 from robotid.dynamics.friction_projection import DriveMoments, drive_moments, project_friction
-from robotid.dynamics.prediction import remember
-from robotid.dynamics.torque import trajectory_regressor
+from robotid.dynamics.torque import remember, trajectory_regressor
 from robotid.robot.drives import (
     Asymmetric,
     Harmonic,

@@ -6,7 +6,7 @@ import pytest
 from helpers.robots import motion
 
 from robotid.data.log import Trajectory
-from robotid.dynamics.prediction import drive_motion_along, is_loaded, remember, rigid_parts
+from robotid.dynamics.torque import drive_motion_along, is_loaded, remember, rigid_parts
 from robotid.robot.drives import Lag, LoadFriction, Presliding
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

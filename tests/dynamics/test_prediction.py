@@ -9,14 +9,14 @@ from helpers.synthetic import truth
 from robotid.base.exceptions import DataError
 from robotid.data.log import Trajectory
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.prediction import (
+from robotid.dynamics.rows import friction_speeds
+from robotid.dynamics.torque import (
     body_slopes,
     body_slopes_by_position,
+    joint_torque_regressor,
     predict,
     predict_instants,
 )
-from robotid.dynamics.rows import friction_speeds
-from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.drives import Lag, LoadFriction, Presliding, Stribeck
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

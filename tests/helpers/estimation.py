@@ -9,7 +9,7 @@ from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.problem import Problem
+from robotid.dynamics.factors import Problem
 from robotid.dynamics.torque import build_problem, joint_torque_regressor
 from robotid.estimation.estimators import (
     OLS,

@@ -16,6 +16,7 @@ from unittest import mock
 
 import lxml.html
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from helpers.pages import numbers_of
 from robotid.cli import main
@@ -151,12 +152,7 @@ def _listed(values):
 
 def turned(quaternion, moments):
     """Return xx, xy, xz, yy, yz, zz of a tensor with these moments along axes w x y z."""
-    w, x, y, z = quaternion
-    R = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    R = Rotation.from_quat(np.roll(list(quaternion), -1)).as_matrix()
     tensor = (R * np.array(moments)) @ R.T
     least = 2e-5 * max(moments)  # quaternions are printed to six digits
     return [float(x) if abs(x) > least else 0.0 for x in tensor[np.triu_indices(3)]]
@@ -263,7 +259,7 @@ def unpacked(value):
                 return {"low": value["low"], "step": value["step"], "codes": told_columns(value)}
             is_log = {"is_log": True} if "log" in value else {}
             return summary(numbers_of(value), _OF_CHART) | is_log
-        usual = {"faint": False, "hidden": False, "half": None, "marks": [], "logarithmic": "",
+        usual = {"is_weak": False, "is_hidden": False, "half": None, "marks": [], "logarithmic": "",
                  "x_names": [], "spans": []}  # fmt: skip
         if value.get("x_label") == "computing time [s]":
             value = {key: x for key, x in value.items() if key != "x"}

@@ -2,10 +2,14 @@
 
 import itertools
 import tomllib
-from dataclasses import replace
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.driven import driven, driven_log, fitted_in
+from helpers.paths import URDF
 from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import DataError, NotConvergedError, SettingsError
@@ -13,18 +17,28 @@ from robotid.cli.identify import identify
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
-from robotid.dynamics import prediction
+from robotid.dynamics import torque
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.prediction import drive_motion_along, predict, remember
+from robotid.dynamics.friction_projection import drive_moments, project_friction
 from robotid.dynamics.rows import COMPILED, TrajectoryRows
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulator import RobotPlant
-from robotid.dynamics.torque import InstantRegressor, joint_torque_regressor, trajectory_regressor
+from robotid.dynamics.torque import (
+    InstantRegressor,
+    drive_motion_along,
+    joint_torque_regressor,
+    predict,
+    remember,
+    trajectory_regressor,
+)
+from robotid.output.files.mjcf import write_mjcf
 from robotid.output.files.urdf import load_identified, read_sidecar, write_urdf
-from robotid.robot.drive_term import DriveMotion
+from robotid.output.report.pictures import friction_chart
+from robotid.robot.drive_term import DriveMotion, Family, MemorylessTerm, Shape
 from robotid.robot.drives import (
     DRIVE_TERMS,
     FAMILIES,
+    TERM_CLASSES,
     TERMS,
     Asymmetric,
     Bristles,
@@ -216,18 +230,6 @@ def test_it_is_written_and_read_back(model, term, rng, tmp_path):
         assert f'{term.dynamics}="{value}"' in (tmp_path / "arm.urdf").read_text()
 
 
-def test_the_layout_knows_its_sign_size_and_preference(model, term):
-    layout, drives = model.layout, drive_part(model)
-    assert set(layout.is_nonnegative()[drives]) == {term.is_nonnegative}
-    assert set(layout.preference()[drives]) == {term.preference}
-    assert set(layout.scales(0.5)[drives]) == {0.25 if term.is_inertia else 1.0}
-    assert [name.split(".")[0] for name in layout.drive_names] == [
-        *JOINTS, *(["motor"] if term.is_shared else []),
-    ]  # fmt: skip
-    assert {found for _, found in layout.drive_parameters} == {term}
-    np.testing.assert_array_equal(layout.drive_loads, R[: len(layout.drives)].T)
-
-
 def test_terms_of_one_drive_stand_side_by_side():
     own = {"elbow_joint": [LoadFriction(), Tanh(speed=0.2)], "motor": [Cubic()]}
     model = RobotModel.from_urdf(
@@ -302,16 +304,9 @@ def test_a_late_torque_is_to_first_order_its_rate(rng):
     motion = random_fourier(model, rng)
     q, v, a = motion.evaluate(t)
     x = Trajectory(
-        t=t,
-        q=q,
-        v=v,
-        a=a,
-        tau=0 * q,
-        joints=JOINTS,
-        rate=200.0,
-        segment=np.zeros(600, dtype=int),
-        direction=np.tanh(v @ R[:3].T / 0.3),
-    )
+        t=t, q=q, v=v, a=a, tau=0 * q, joints=JOINTS, rate=200.0,
+        segment=np.zeros(600, dtype=int), direction=np.tanh(v @ R[:3].T / 0.3),
+    )  # fmt: skip
     with_lag = predict(model, [pi], remember(model, x))[0]
     punctual = replace(x, memory=np.zeros((600, 3)))
     on_time = predict(model, [pi], punctual)[0]
@@ -369,7 +364,7 @@ def test_a_hook_that_only_slow_motion_shows_is_a_base_parameter():
 
 
 def test_what_drives_remember_is_of_the_model_not_of_what_was_remembered_before(rng, monkeypatch):
-    monkeypatch.setattr(prediction, "_START", 10**9)  # by rows, which check the memory
+    monkeypatch.setattr(torque, "_START", 10**9)  # by rows, which check the memory
     path, own = example_urdf("ur5_robot.urdf"), {"elbow_joint": [LoadFriction(), Lag()]}
     model = RobotModel.from_urdf(path, joints=JOINTS, own_terms=own)
     x, other = states(rng), model.with_reference(truth(model))
@@ -493,3 +488,72 @@ def test_the_line_of_a_drive_is_read_back_as_it_was():
     assert entries[1] == "load"
     assert term_from_dict(entries[0]) == Harmonic(order=3.0, is_sine=True), "the range is the log's"
     assert term_from_dict(entries[2]) == Spring()
+
+
+JOINT = "joint_1"
+TRUE, SIZE, SPEED = f"{JOINT}.bend", 1.4, 0.25
+
+
+@dataclass(frozen=True)
+class Bend(MemorylessTerm):
+    """Friction that sets in over a speed, tau = x atan(w / w_b)."""
+
+    speed: float = 0.1
+
+    label = "bend"
+    guards = "v"
+    usual = (0.3, 0.6)
+
+    @staticmethod
+    def speed_law(w, speed):
+        z = w / speed
+        return np.arctan(z), 1.0 / (speed * (1.0 + z * z))
+
+
+@pytest.fixture
+def bend(monkeypatch):
+    """The term with its family in the catalogue, a robot that has it, and its parameters."""
+    family = Family(
+        "bend", "friction that bends", lambda own, speed: (Bend(data_range=own["v"], speed=speed),),
+        (Shape("speed", ("rad/s", "m/s"), (0.01, 0.5), "v"),), is_automatic=True,
+    )  # fmt: skip
+    monkeypatch.setitem(TERM_CLASSES, "Bend", Bend)
+    monkeypatch.setitem(FAMILIES, "bend", family)
+    plain = RobotModel.from_urdf(URDF / "planar_2r.urdf")
+    term = Bend(data_range=(0.0, 30.0), speed=SPEED)
+    true, pi = driven(plain, {JOINT: (term,)}, {TRUE: SIZE})
+    return SimpleNamespace(plain=plain, true=true, pi=pi, term=term)
+
+
+def law(v):
+    """Return the friction of the joint beside viscous and Coulomb's."""
+    return SIZE * np.arctan(v / SPEED)
+
+
+def test_a_new_term_is_identified_drawn_and_exported(bend, tmp_path):
+    log = driven_log(bend.true, bend.pi, 3, duration=20.0, noise=0.001)
+    found = fitted_in(bend.plain, [log], friction={JOINT: "bend", "*": "none"})
+    (choice,) = found.drives
+    ((shape,), (own,)) = choice.shapes, found.model.layout.own[JOINT]
+    assert abs(shape.value - SPEED) < 3 * shape.std_error < 0.1 * SPEED
+    assert term_from_dict(own.to_dict()) == own
+    values = dict(zip(found.model.layout.names, found.standard, strict=True))
+    assert values[TRUE] == pytest.approx(SIZE, rel=0.1)
+
+    chart = friction_chart(found, JOINT)
+    steady, v = chart.series[2].y, chart.x
+    truth = dict(zip(bend.true.layout.names, bend.pi, strict=True))
+    viscous, coulomb, offset = (truth[f"{JOINT}.{x}"] for x in ("viscous", "coulomb", "offset"))
+    wanted = law(v) + viscous * v + coulomb * np.sign(v) + offset
+    drawn = np.isfinite(steady)  # the line breaks where friction reverses
+    np.testing.assert_allclose(steady[drawn], wanted[drawn], atol=0.05)
+    assert drawn.sum() > 100
+
+    rows = [(e.recording.trajectory, e.recording.mask) for e in found.fitted]
+    moments = drive_moments(found.model, rows)
+    simple = project_friction(found.model, found.standard, moments, ("viscous", "coulomb"))
+    (drive,) = simple.drives
+    assert drive.replaced == ("bend",)
+    write_mjcf(simple.model, simple.pi, tmp_path / "robot.xml")
+    (joint,) = (x for x in ET.parse(tmp_path / "robot.xml").iter("joint") if x.get("name") == JOINT)
+    assert float(joint.get("damping")) == pytest.approx(drive.values["viscous"])

@@ -29,7 +29,6 @@ import numpy as np
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.typing import Array
-from robotid.dynamics.compiled import Tree
 from robotid.dynamics.kernels.lanes import (
     LANES,
     applied,
@@ -59,6 +58,7 @@ from robotid.dynamics.kernels.tree_lanes import (
     mass_matrix,
     place,
 )
+from robotid.dynamics.rows import Tree
 from robotid.robot.drive_term import BRISTLES, LOADED, PLAIN, DriveTerm, Law, MemorylessTerm
 from robotid.robot.drives import Bristles
 

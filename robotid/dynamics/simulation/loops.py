@@ -18,8 +18,8 @@ from robotid.base.exceptions import NotConvergedError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.data.log import Log
-from robotid.dynamics.compiled import Tree, flatten, why_not
 from robotid.dynamics.factors import in_order
+from robotid.dynamics.rows import Tree, flatten, why_not
 from robotid.robot.drive_term import BRISTLES, DIRECTED, DriveTerm, MemorylessTerm
 from robotid.robot.drives import Bristles
 from robotid.robot.mass_matrix import rigid_mass_matrices

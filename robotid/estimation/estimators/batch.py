@@ -36,11 +36,8 @@ class OLS(BatchEstimator):
     The covariance is ``(W^T W)^-1 (sum_j sigma_j^2 W_j^T W_j) (W^T W)^-1``.
     """
 
-    #: Parameter values for directions that are not identifiable, shape (c,); None: an error if any.
-    prior: Array | None = None
-    #: Share of independent rows [-], 2 cutoff / rate for low-pass filtered rows. The covariance is
-    #: divided by it.
-    independent_share: float = 1.0
+    prior: Array | None = None  # (c,), of directions not identifiable; None: an error if any
+    independent_share: float = 1.0  # 2 cutoff / rate; it divides the covariance [-]
 
     @property
     def weighing(self) -> Weighing:
@@ -105,8 +102,7 @@ class TLS(BatchEstimator):
     Huffel, Vandewalle (1991), The Total Least Squares Problem, 3.6.
     """
 
-    #: RMS noise of the columns over their RMS [-]; None: 0.01, reduced if it exceeds half of the
-    #: residual's variance.
+    #: RMS noise of columns over their RMS; None: 0.01, or half of the residual's variance if less.
     regressor_noise: float | None = _TLS_NOISE
     independent_share: float = 1.0  # as in ``OLS``
 

@@ -32,9 +32,7 @@ from robotid.robot.parameters import ParameterLayout, pseudo_inertia, pseudo_ine
 
 _FLOOR = 1e-6  # smallest noise level over the torque, for noise-free data
 _ACTIVE = 1e-5  # slack below which a constraint is active, dimensionless
-#: Lower bound of drive terms over their scale, as rounding must not negate them, and tolerance for
-#: a pinned body outside its bounds [kg], [m].
-_ROUNDING = 1e-9
+_ROUNDING = 1e-9  # of drives over their scale above 0, and of pinned bodies within bounds [kg], [m]
 _OPEN = (0.0, np.inf)  # [kg]
 
 _SMALLEST, _LARGEST = -4.0, 2.0  # decades of the weights tried
@@ -42,8 +40,7 @@ _USUAL = -1.0  # at smaller entropic weights bodies become thin, and fits conver
 _PATIENCE = 2  # decades without a better score after which the search ends
 _MOST_LOSS = 1.02  # largest ratio of the held-out errors of a larger weight, mean over joints
 _MOST_JOINT_LOSS = 1.05  # ... and of any one joint
-#: Largest ratio of the held-out error of a joint to that of least squares.
-AS_GOOD = 1.1
+AS_GOOD = 1.1  # largest ratio of the held-out error of a joint to that of least squares
 _BEYOND = 4.0  # standard errors by which a body must be outside its box
 _REESTIMATED = 8  # largest number of steps of the plausible weight
 _EXPECTED = (0.5, 1.02)  # distances from the prior over the expected one at which they end
@@ -52,17 +49,13 @@ _STEP = 0.5  # decades between the best weight and the refined ones
 
 @dataclass(frozen=True, eq=False)
 class Constraints:
-    """Bounds in addition to physical consistency, by name of the body that a joint moves."""
+    """Bounds in addition to consistency, by name of the body that a joint moves, in its frame."""
 
     mass: dict[str, tuple[float, float]] = field(default_factory=dict)  # smallest, largest [kg]
     total_mass: tuple[float, float] | None = None  # of all bodies together [kg]
-    #: Half-spaces A c <= b that contain the centre of mass c of a body in its own frame: A of shape
-    #: (k, 3), unit rows, and b of shape (k,) [m].
-    com: dict[str, tuple[Array, Array]] = field(default_factory=dict)
+    com: dict[str, tuple[Array, Array]] = field(default_factory=dict)  # A c <= b, (k, 3), (k,) [m]
     pinned: tuple[str, ...] = ()  # bodies that keep the prior's values
-    #: Box that contains all mass of a body: lower and upper corner in its own frame, shape (2, 3)
-    #: [m]; see ``slabs``.
-    extent: dict[str, Array] = field(default_factory=dict)
+    extent: dict[str, Array] = field(default_factory=dict)  # box of all mass, (2, 3) [m]
     relaxed: tuple[str, ...] = ()  # bodies whose extent was removed: the data contradict it
 
     def without_extent(self, bodies: Iterable[str]) -> "Constraints":
@@ -191,9 +184,7 @@ class WeightChoice:
 
     weight: float
     how: str  # "cv" or "evidence"
-    #: Pairs of weight and score, by ascending weight: the prediction error of held-out segments
-    #: over the noise level ("cv"), or minus the log evidence.
-    curve: tuple[tuple[float, float], ...]
+    curve: tuple[tuple[float, float], ...]  # ascending weights, scores
     plausible: float  # weight with the largest log evidence
     loss: float = 0.0  # largest ratio of the held-out error of a joint to that of least squares
 
@@ -220,9 +211,7 @@ class Consistent(BatchEstimator):
     K: Array  # (b, p), map to the base parameters
     prior: Array  # (p,), prior values, as the URDF's
     prior_std: Array  # (p,), prior standard deviations, positive
-    #: Known part of each body, as the links on locked joints, shape (10 bodies,); the rest of the
-    #: body must be physically consistent. None: no known parts.
-    held: Array | None = None
+    held: Array | None = None  # (10 bodies,), known part of each, as on locked joints; or none
     prior_weight: float = 1.0
     plausible_weight: float = 1.0  # at which the prior has the spread of the true parameters
     independent_share: float = 1.0  # 2 cutoff / rate

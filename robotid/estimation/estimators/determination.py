@@ -72,9 +72,7 @@ class Determination:
 
     names: tuple[str, ...]  # of the b base parameters
     spread: Array  # (b,), prior standard deviation; 0 for known ones
-    #: Standard deviation after the data over that before them, for b orthogonal directions in units
-    #: of the spread, ascending, shape (b,) [-]; 0 for known ones.
-    shrinkage: Array
+    shrinkage: Array  # (b,), spread after over before data, of orthogonal directions; 0: known
     weak: Array  # (b, b - rank), the weak directions, in units of the spread, orthonormal
     groups: tuple[Group, ...]
 

@@ -10,8 +10,7 @@ import scipy.special
 
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
-from robotid.dynamics.factors import Factors, compress
-from robotid.dynamics.problem import Problem
+from robotid.dynamics.factors import Factors, Problem, compress
 
 DataT = TypeVar("DataT", contravariant=True)
 
@@ -77,9 +76,7 @@ class Estimate:
 class Estimator(ABC, Generic[DataT]):
     """Interface of estimators: settings are constructor arguments, data arguments of ``fit``."""
 
-    #: Form of the data: triangular factors of all rows, the samples one by one, or a simulator that
-    #: is compared with the data.
-    reads: ClassVar[Literal["factors", "samples", "simulator"]]
+    reads: ClassVar[Literal["factors", "samples", "simulator"]]  # form of the data
 
     @property
     def weighing(self) -> Weighing:

@@ -12,8 +12,7 @@ from scipy.linalg.lapack import dtpqrt
 
 from robotid.base.exceptions import DataError, RankDeficientError
 from robotid.base.typing import Array
-from robotid.dynamics.factors import Factors
-from robotid.dynamics.problem import Problem, Sample, shuffled
+from robotid.dynamics.factors import Factors, Problem, Sample, shuffled
 from robotid.estimation.estimators.batch import SILENT, solve_factor
 from robotid.estimation.estimators.determination import PRIOR_LED
 from robotid.estimation.estimators.estimator import (
@@ -341,8 +340,7 @@ class Descent(RecursiveEstimator[DescentState]):
 
     sigma: Array  # (n,), noise level of each joint [N m or N]
     prior: Array | None = None  # (c,), initial values; 0 if None
-    #: Column scaling, shape (c,); None: ``fit`` uses the column norms, ``init`` does not scale.
-    scale: Array | None = None
+    scale: Array | None = None  # (c,), of columns; None: ``fit`` uses their norms, ``init`` none
     average: bool = True  # whether the estimate is the average of the iterates; better with noise
     passes: int = 4  # largest number of passes of ``fit``
     rng: np.random.Generator | None = None  # of the order of the samples; None: order of time

@@ -12,8 +12,8 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.dynamics.constraint_rows import without_forces
-from robotid.dynamics.prediction import drive_motion_along
 from robotid.dynamics.rows import friction_directions
+from robotid.dynamics.torque import drive_motion_along
 from robotid.estimation.fitting.evaluation import Recording
 from robotid.robot.drive_term import DriveMotion, DriveTerm, Family
 from robotid.robot.drives import FAMILIES
@@ -54,14 +54,11 @@ class DriveChoice:
     shapes: tuple[FoundShape, ...] = ()  # the identified shape parameters
     shape_covariance: tuple[tuple[float, ...], ...] = ()  # their covariance, row by row
     sizes: tuple[tuple[float, ...], ...] = ()  # values of the shape parameters of each family
-    #: Ranges of position "q" and of absolute speed "v" in the fitted rows.
-    data_range: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    data_range: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # "q", |"v"|
     #: Factor by which the terms increase the standard errors of the drive's armature, viscous and
     #: Coulomb friction and offset, by name.
     grown: Mapping[str, float] = field(default_factory=dict)
-    #: Terms that reduce the held-out residual, but not significantly. They were not selected; the
-    #: standard errors include the change that they would cause.
-    undecided: tuple[DriveTerm, ...] = ()
+    undecided: tuple[DriveTerm, ...] = ()  # not significant; errors include their change
 
     def to_dict(self) -> dict[str, Any]:
         """Return the sets tried, the selected families and the shapes, as plain values."""
@@ -183,8 +180,7 @@ class OpenTerm:
 
     joint: str
     moves: Array  # (p,), change of the standard parameters that it causes
-    #: Its own torque, (N,) [N m or N], from the motion of the drive and of the joint.
-    torque: Callable[[DriveMotion, JointMotion], Array]
+    torque: Callable[[DriveMotion, JointMotion], Array]  # (N,) [N m or N]
 
 
 def open_torques(

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
@@ -112,11 +112,6 @@ class EstimatorSettings(Settings):
     error.
     """
 
-    #: Whether all rows have equal weights, whatever the noise of their joints.
-    has_equal_weights: ClassVar[bool] = False
-    #: Whether the estimator itself accounts for noise of the regressor.
-    allows_for_noise: ClassVar[bool] = False
-
     name: str = setting("consistent", "name of the estimator")
 
     def __new__(cls, name: str = "consistent", **options: object) -> "EstimatorSettings":
@@ -216,9 +211,7 @@ class RecursiveSettings(BoundedSettings):
 
 @dataclass(frozen=True)
 class OLSSettings(EstimatorSettings):
-    """Settings of ordinary least squares: none."""
-
-    has_equal_weights: ClassVar[bool] = True
+    """Settings of ordinary least squares: none, all rows have equal weights."""
 
     name: str = _called("ols", "ordinary least squares")
 
@@ -233,8 +226,6 @@ class WLSSettings(RobustSettings):
 @dataclass(frozen=True)
 class TLSSettings(EstimatorSettings):
     """Settings of total least squares."""
-
-    allows_for_noise: ClassVar[bool] = True
 
     name: str = _called("tls", "total least squares, which also models noise of the regressor")
     regressor_noise: float | None = setting(
@@ -337,8 +328,7 @@ class SimulationSettings(EstimatorSettings):
     )
 
 
-#: The settings of each estimator, by its name.
-ESTIMATORS: Mapping[str, type[EstimatorSettings]] = {
+ESTIMATORS: Mapping[str, type[EstimatorSettings]] = {  # by name
     kind.name: kind
     for kind in (
         OLSSettings,

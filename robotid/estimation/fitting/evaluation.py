@@ -16,7 +16,7 @@ from robotid.data.log import Log, Trajectory, alike_motions
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import turns_note
 from robotid.dynamics.factors import Factors, merge
-from robotid.dynamics.prediction import predict
+from robotid.dynamics.torque import predict
 from robotid.estimation.fitting.recorded import LogPiece, SurveyedLog
 from robotid.estimation.work_plan import WorkPlan
 from robotid.robot.model import RobotModel
@@ -24,10 +24,8 @@ from robotid.robot.model import RobotModel
 _SHOWN = 10_000  # samples at the start, in the middle and at the end that are stored for plots
 _SAMPLED = 200  # rows spread over a log that are searched for in other logs
 _SHARED = 0.02  # share of them that another log may contain: adjacent windows share a row
-#: End of the name of a log that a fit to the others predicts.
-LEFT_OUT = ", left out of the fit"
-#: Smallest number of different motions of which each is predicted by the others.
-FEWEST_LEFT_OUT = 3
+LEFT_OUT = ", left out of the fit"  # end of the name of a log that a fit to the others predicts
+FEWEST_LEFT_OUT = 3  # smallest number of different motions of which each is predicted by the others
 _FITS = 10  # largest number of fits; more motions are left out together
 
 
@@ -56,8 +54,7 @@ class JointMetrics:
 class Metrics:
     """Metrics of every joint of one recording."""
 
-    #: Metrics by name of the joint; joints without rows are not in it.
-    per_joint: Mapping[str, JointMetrics]
+    per_joint: Mapping[str, JointMetrics]  # by name of the joint; joints without rows are not in it
     pooled_rmse: float  # root mean square of the residuals of all joints together [N m, N]
 
     def to_dict(self) -> dict[str, Any]:
@@ -75,8 +72,7 @@ class TorqueSums:
     spread: Array  # (n,), sum of squared deviations of the torque from the mean
     torque: Array  # (n,), sum of squares of the torque
     residual: Array  # (n,), sum of squared residuals of the prediction
-    #: Sums of squared residuals of other predictions, by name, each of shape (n,).
-    baselines: Mapping[str, Array]
+    baselines: Mapping[str, Array]  # (n,), sums of squared residuals of other predictions
 
     @classmethod
     def of(

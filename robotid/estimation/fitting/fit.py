@@ -16,7 +16,7 @@ from robotid.base.exceptions import NotConvergedError, RankDeficientError, Setti
 from robotid.base.typing import Array
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors, Reduction, gather, join
-from robotid.dynamics.prediction import body_slopes_by_position, is_loaded
+from robotid.dynamics.torque import body_slopes_by_position, is_loaded
 from robotid.estimation import estimators
 from robotid.estimation.estimators import WLS, Consistent, Constraints, Estimate
 from robotid.estimation.estimators.consistent_fit import (
@@ -60,8 +60,7 @@ from robotid.estimation.variation.groups import (
     sums_of,
     with_zeros,
 )
-from robotid.robot.bodies import held_parameters, negligible_bodies
-from robotid.robot.geometry import body_boxes
+from robotid.robot.bodies import body_boxes, held_parameters, negligible_bodies
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
@@ -451,10 +450,10 @@ def _without_regressor_noise(ground: _Ground, choice: EstimatorSettings) -> _Gro
 
     For estimators that read samples the bias is counted as an error.
     """
-    if choice.allows_for_noise:
+    if isinstance(choice, settings.TLSSettings):
         return ground
     level, theta = ground.rough.sigma, ground.rough.theta
-    sigma = np.ones_like(level) if choice.has_equal_weights else level
+    sigma = np.ones_like(level) if isinstance(choice, settings.OLSSettings) else level
     noise = find_regressor_noise(ground.recordings, ground.reduction, theta, sigma, level)
     if noise is None:
         return ground

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.settings import is_number, require_kind
 from robotid.base.typing import Array, real_numbers
-from robotid.data.log import suggestion
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors
 from robotid.dynamics.friction_projection import (
@@ -21,7 +20,7 @@ from robotid.dynamics.friction_projection import (
     drive_moments,
     projected_pinocchio_model,
 )
-from robotid.dynamics.prediction import drive_motion_along, predict_instants
+from robotid.dynamics.torque import drive_motion_along, predict_instants
 from robotid.estimation.estimators import Estimate
 from robotid.estimation.estimators.determination import Determination, is_poorly_excited
 from robotid.estimation.fitting.drive_terms import DriveChoice, JointMotion, OpenTerm, open_torques
@@ -45,8 +44,7 @@ from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
-#: The possible sources of the value of a standard parameter.
-SOURCES = ("data", "mixed", "prior", "bound")
+SOURCES = ("data", "mixed", "prior", "bound")  # of the value of a standard parameter
 #: Standard error over prior standard deviation below which the source is the data (a change above
 #: it does not come from the prior alone), and above which it is the prior.
 FROM_DATA, FROM_PRIOR = 0.3, 0.9
@@ -170,9 +168,7 @@ class Solution:
     standard: Array  # (p,), standard parameters
     fitted: tuple[Evaluation, ...]  # the fitted recordings
     validation: tuple[Evaluation, ...]  # the validation recordings
-    #: Friction of the joints in addition to viscous and Coulomb friction, and the terms that were
-    #: tried.
-    drives: tuple[DriveChoice, ...] = ()
+    drives: tuple[DriveChoice, ...] = ()  # friction terms of the joints, and those tried
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -189,16 +185,11 @@ class Fit(Identified, Solution):
     errors: StandardErrors  # method and degrees of freedom of the standard errors
     factors: Factors  # triangular factors of the fitted rows, base parameters
     determination: Determination  # which base parameters the fitted rows determine
-    #: Uncertainties of the drive models; ``standard_covariance`` includes them.
-    open_terms: tuple[OpenTerm, ...] = ()
-    #: Effect of position quantisation on least squares; None: negligible.
-    regressor_noise: RegressorNoise | None = None
-    #: Information of each of three or more fitted logs on parameters that may vary.
-    runs: tuple[RunsOf, ...] = ()
+    open_terms: tuple[OpenTerm, ...] = ()  # uncertain terms, in the covariance
+    regressor_noise: RegressorNoise | None = None  # of position quantisation; or negligible
+    runs: tuple[RunsOf, ...] = ()  # information of three or more logs on varying parameters
     sums: RunSums | None = None  # sums over their rows from which it is computed
-    #: Without validation logs, metrics of each fitted log as a fit to the others predicts it, by
-    #: its name.
-    left_out: Mapping[str, Metrics] = field(default_factory=dict)
+    left_out: Mapping[str, Metrics] = field(default_factory=dict)  # by log, of fits to the others
     variation: Variation | None = None  # variation of the drives' parameters between these logs
     _checked: list[tuple[Array, MassMatrixCheck]] = field(default_factory=list, repr=False)
 

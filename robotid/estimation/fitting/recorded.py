@@ -15,12 +15,11 @@ import numpy as np
 
 from robotid.base.exceptions import DataError
 from robotid.base.findings import listed
-from robotid.base.text import seconds
 from robotid.base.typing import Array
 from robotid.data.base_motion import bias_at_rest
 from robotid.data.files.read import LogLayout, open_table
 from robotid.data.files.table import Place, RowReader, Table
-from robotid.data.log import Log, Trajectory, blocks_of, map_stamps, median_step
+from robotid.data.log import Log, Trajectory, blocks_of, map_stamps, median_step, rows_within
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import (
     SPLINE,
@@ -35,13 +34,15 @@ from robotid.data.units import check_reach, check_units
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.constraint_rows import constrained, logged_base
 from robotid.dynamics.factors import (
+    Block,
     Factors,
+    Problem,
     Reduction,
     compress,
     compress_segments,
+    concatenate,
     join_segments,
 )
-from robotid.dynamics.prediction import is_loaded, remember
 from robotid.dynamics.prepared_logs import (
     base_problem,
     closed_log,
@@ -51,15 +52,13 @@ from robotid.dynamics.prepared_logs import (
     static_rows,
     with_contacts,
 )
-from robotid.dynamics.problem import Block, Problem, concatenate
 from robotid.dynamics.rows import COMPILED, choose_engine, friction_speeds, keep_inertial_rows
+from robotid.dynamics.torque import is_loaded, remember
 from robotid.estimation.work_plan import WorkPlan
 from robotid.robot.model import RobotModel
 
-#: Default number of rows of a piece.
-PIECE = 16384
-#: Rows of each window that is checked.
-WINDOW = 20_000
+PIECE = 16384  # default number of rows of a piece
+WINDOW = 20_000  # rows of each window that is checked
 _SEGMENTS = 48  # of all logs in memory: enough to estimate the scatter of their scores
 _CORRELATIONS = 10  # shortest segment, in correlation times of filtered noise
 _SEGMENTS_IN_FILE = 64  # largest number of segments of a log in a file
@@ -368,12 +367,14 @@ def survey_log(
         log = layout.to_log(whole)
         check_units(log, layout.units, layout.prismatic, layout.turning)
         used = log if window == (None, None) else log.window(*window)
-        inside = slice(*np.searchsorted(log.t, [used.t[0], np.nextafter(used.t[-1], np.inf)]))
+        inside = slice(*rows_within(log.t, log.name, *window))
         positions = _positions(locked, [whole], layout, model, inside)
         return hold_log(model, used, signals, positions)
     reader, places, where = table.reader(wanted), list[Place](), Path(layout.path).name
     stamps = map_stamps(_stamps(reader, layout, places), where)
-    first, stop = _window(stamps, where, *window)
+    if len(stamps) < 2:
+        raise DataError(f"{where} has {len(stamps)} rows, wanted at least 2")
+    first, stop = rows_within(stamps, where, *window)
     ranges = _close_looks(first, stop)
     columns = [reader.read(wanted, i, j, _near(places, i)) for i, j in ranges]
     windows = tuple(_log_of(layout, x, i) for x, (i, _) in zip(columns, ranges, strict=True))
@@ -432,24 +433,6 @@ def _stamps(rows: RowReader, layout: LogLayout, places: list[Place]) -> Iterator
 
 def _near(places: Sequence[Place], row: int) -> Place:
     return places[max(bisect_right(places, row, key=lambda place: place.row) - 1, 0)]
-
-
-def _window(stamps: Array, where: str, start: float | None, end: float | None) -> tuple[int, int]:
-    """Return the rows from start to end; see ``Log.window``."""
-    count = len(stamps)
-    if count < 2:
-        raise DataError(f"{where} has {count} rows, wanted at least 2")
-    first = 0 if start is None else int(np.searchsorted(stamps, start))
-    stop = count if end is None else int(np.searchsorted(stamps, end, side="right"))
-    if stop - first < 2:
-        low, high = stamps[0], stamps[-1]
-        raise DataError(
-            f"{where}: {max(stop - first, 0)} rows lie between "
-            f"{seconds(low if start is None else start)} s and "
-            f"{seconds(high if end is None else end)} s; the log spans {seconds(low)} s to "
-            f"{seconds(high)} s. Choose start and end inside it"
-        )
-    return first, stop
 
 
 def _close_looks(first: int, stop: int) -> list[tuple[int, int]]:
@@ -515,12 +498,9 @@ class Recordings:
     mapping: BaseMapping  # standard to base parameters
     fitted: Sequence[SurveyedLog]  # logs to fit
     validation: Sequence[SurveyedLog] = ()  # validation logs
-    #: Processes that work on the pieces of logs in files; None: this process.
-    plan: WorkPlan | None = None
-    #: Weights of the rows of each log to fit, shapes (N, n_rows); 1 if None.
-    weights: tuple[Array, ...] | None = None
-    #: Effect of errors of points of contact and of an IMU; None without any.
-    repeated: RepeatedErrors | None = None
+    plan: WorkPlan | None = None  # processes for the pieces of logs in files; None: this process
+    weights: tuple[Array, ...] | None = None  # of rows by log, (N, n_rows); or 1
+    repeated: RepeatedErrors | None = None  # of points of contact and of an IMU
     #: (n,), noise levels of an earlier fit, from which the next one starts.
     levels: Array | None = None
 

@@ -45,17 +45,11 @@ _FREQUENCIES = 2048  # frequencies at which the noise of an acceleration is summ
 class RegressorNoise:
     """Effect of position quantisation on least squares."""
 
-    #: (n,), largest quantisation step of each joint's position in the logs [rad or m]; 0: none, or
-    #: without effect because velocities are measured.
-    steps: Array
+    steps: Array  # (n,), quantisation of positions [rad or m]; 0: none, or velocities are measured
     share: Array  # (n,), RMS of the quantisation noise of each acceleration over its RMS [-]
     shift: Array  # (b,), bias of the base parameters, E[theta_ls] - theta
-    #: (b,), standard errors of the base parameters by residual and filter, without the
-    #: quantisation; inf if not identifiable.
-    std_error: Array
-    #: (b, b), covariance of the score that the scatter of segments does not include: of repeated
-    #: rounding errors and of the shift.
-    meat: Array
+    std_error: Array  # (b,), of base parameters without the quantisation; inf: not identifiable
+    meat: Array  # (b, b), of the score: repeated rounding errors and the shift, without scatter
     is_corrected: bool = True  # if the estimate is not corrected, its covariance has the shift
 
     def uncorrected(self, information: Array) -> "RegressorNoise":

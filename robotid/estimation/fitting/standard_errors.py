@@ -17,18 +17,12 @@ from robotid.dynamics.factors import Factors
 from robotid.dynamics.torque import trajectory_regressor
 from robotid.estimation.estimators import Consistent, Estimate
 from robotid.estimation.estimators.batch import solve_factor
-from robotid.estimation.estimators.estimator import (
-    FEWEST_SEGMENTS,
-    quantile,
-    sandwich,
-    scatter,
-)
+from robotid.estimation.estimators.estimator import FEWEST_SEGMENTS, quantile, sandwich, scatter
 from robotid.robot.model import RobotModel
 
 _DRAWS = 64  # fits to resampled data and prior, for standard errors with active bounds
 _LEAST_SOLVED = 0.8  # smallest share of them that must be solved
-#: Half-width of a 95 % band in standard deviations.
-QUANTILE = 1.96
+QUANTILE = 1.96  # half-width of a 95 % band in standard deviations
 _ROUNDING = 1e-9  # relative tolerance for a row on the edge of the band
 _MOST = 500  # largest number of samples at which a band is computed
 
@@ -41,9 +35,7 @@ class StandardErrors:
     segments: int  # number of segments whose scores were used
     inflation: float  # variance of the scores over that of independent rows [-]
     freedom: Array  # (b,), degrees of freedom of each base parameter's standard error
-    #: (p,), standard errors of the standard parameters without the bounds; None if no bound is
-    #: active.
-    unbounded: Array | None = None
+    unbounded: Array | None = None  # (p,), standard errors without the bounds; None: none is active
 
     @property
     def quantile(self) -> Array:

@@ -19,8 +19,7 @@ from robotid.dynamics.factors import Factors
 from robotid.estimation.variation.spread import Runs
 from robotid.robot.model import RobotModel
 
-#: Smallest number of runs whose scatter is estimated.
-FEWEST_RUNS = 3
+FEWEST_RUNS = 3  # smallest number of runs whose scatter is estimated
 _DRIVE = 0.1  # plausible standard deviation of a drive term, over the drive's torque
 _GAIN = 0.02  # ... of a gain
 _MASS = 0.01  # ... of the mass on the last link, over the mass of the robot

@@ -33,9 +33,7 @@ _STEPS = 60  # of each chain; with a possible proposal, one step is an independe
 class Runs:
     """Information of k runs about q parameters that may vary."""
 
-    #: (k, q, q), information (inverse covariance) of each run, symmetric; singular if the run does
-    #: not determine all.
-    H: Array
+    H: Array  # (k, q, q), information of each run (inverse covariance), may be singular
     h: Array  # (k, q), H times the estimate of each run
     unit: Array  # (k,), index of the unit (robot) of each run, int, from 0
     scale: Array  # (q,), plausible standard deviation of each parameter, positive
@@ -110,8 +108,7 @@ class Prediction:
     #: Expected standard error of the mean, and expected width of the prediction interval, with one
     #: more run, or one more unit if there are several.
     after: tuple[float, float] = (math.nan, math.nan)
-    #: Median of the standard deviation between runs of a unit, if there are several units.
-    within: float | None = None
+    within: float | None = None  # median spread between runs of a unit, if there are several units
 
     @cached_property
     def ends(self) -> Array:

@@ -19,10 +19,8 @@ from robotid.estimation.variation.spread import (
     covariance_of,
 )
 
-#: Standard normal scores at which result.json has the quantiles of the predictive distribution.
-SCORES = np.linspace(-3.5, 3.5, 15)
-#: Probability that one of alike runs or units is named.
-FALSE_ALARMS = 0.02
+SCORES = np.linspace(-3.5, 3.5, 15)  # of the quantiles in result.json
+FALSE_ALARMS = 0.02  # probability that one of alike runs or units is named
 _LEAST_SHRUNK = 1e-3  # smallest share of the shrinkage: the correlation has an inverse
 _SCALE = 0.1  # smallest plausible standard deviation between units, over the parameter's size
 _SPREADS = 32  # standard deviations between units over which a test is integrated
@@ -85,9 +83,7 @@ class Variation:
     parameters: tuple[VaryingParameter, ...]  # the parameters of the drives, m items
     unlike: tuple[UnlikeRun, ...]  # runs that differ from the others, at most one cause for each
     unit_names: tuple[str, ...] = ()  # names of the units, in the order of their indices
-    #: Units that differ from the others, at most one cause for each; their runs are not in
-    #: ``unlike``.
-    unlike_units: tuple[UnlikeRun, ...] = ()
+    unlike_units: tuple[UnlikeRun, ...] = ()  # one cause for each; their runs are not in ``unlike``
     of_runs: tuple[int, ...] = ()  # index of the unit of each run, k items
 
     @cached_property

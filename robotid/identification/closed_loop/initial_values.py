@@ -16,10 +16,10 @@ from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import zero_phase
-from robotid.dynamics.compiled import flatten
-from robotid.dynamics.prediction import predict_instants
+from robotid.dynamics.rows import flatten
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, Loops, Window
 from robotid.dynamics.simulation.simulation_settings import PerJoint
+from robotid.dynamics.torque import predict_instants
 from robotid.estimation.estimators.output_error import OutputError
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.loop_simulator import (
@@ -321,34 +321,27 @@ def free_drive_parameters(
         members.setdefault(group, []).append(j)
     is_closed = np.full(len(groups), loop.kind != "torque")
     # each drive has its own limit; delays are mostly those of the bus and the controller
-    sharing: dict[str, dict[str, list[int]]] = {
-        "limit": {joint: [j] for j, joint in enumerate(model.joints)}
-    }
-    if loop.delays == "one":
-        sharing["delay"] = {"robot": [*range(len(groups))]}
-    free = {
-        "armature": np.full(len(groups), "armature" in model.layout.terms),
-        "kp": ~is_stated(loop.kp, model) & is_closed,
-        "kd": ~is_stated(loop.kd, model) & finds_kd,
-        "limit": finds_limit,
-        "delay": ~is_stated(loop.delay, model) & is_closed,
-    }
-    spread = {
-        "armature": typical.inertia,
-        "kp": base.kp / _WIDE,
-        "kd": typical.torque / typical.speed,
-        "limit": typical.torque,
-        "delay": np.full(len(groups), LONGEST_DELAY / _WIDE),
-    }
+    alone = {joint: [j] for j, joint in enumerate(model.joints)}
+    delayed = {"robot": [*range(len(groups))]} if loop.delays == "one" else members
+    has_armature = np.full(len(groups), "armature" in model.layout.terms)
+    closed_kp, closed_delay = (~is_stated(x, model) & is_closed for x in (loop.kp, loop.delay))
     found = []
-    for what, is_free in free.items():
-        for name, joints in sharing.get(what, members).items():
-            own = tuple(j for j in joints if is_free[j])
-            if own:
-                initial = float(np.median(getattr(base, what)[list(own)]))
-                wide = _WIDE * float(np.median(spread[what][list(own)]))
+    for what, sharing, is_free, spread in (
+        ("armature", members, has_armature, typical.inertia),
+        ("kp", members, closed_kp, base.kp / _WIDE),
+        ("kd", members, ~is_stated(loop.kd, model) & finds_kd, typical.torque / typical.speed),
+        ("limit", alone, finds_limit, typical.torque),
+        ("delay", delayed, closed_delay, np.full(len(groups), LONGEST_DELAY / _WIDE)),
+    ):
+        for name, joints in sharing.items():
+            sharers = [j for j in joints if is_free[j]]
+            if sharers:
+                initial = float(np.median(getattr(base, what)[sharers]))
+                wide = _WIDE * float(np.median(spread[sharers]))
                 lowest = _LEAST * initial if what in ("kp", "limit") else 0.0
-                found.append(FreeParameter(f"{name}.{what}", what, own, initial, wide, lowest))
+                found.append(
+                    FreeParameter(f"{name}.{what}", what, tuple(sharers), initial, wide, lowest)
+                )
     for group, joints in members.items():
         for term in {t: None for j in joints for t in base.terms[j]}:
             having = [j for j in joints if term in base.terms[j]]

@@ -27,14 +27,6 @@ from robotid.dynamics.simulation.simulation_settings import by_joint
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import OutputError
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings, SimulationSettings
-from robotid.identification.closed_loop.further_parameters import (
-    GainScale,
-    Tried,
-    candidates,
-    choose,
-    gain_scale,
-    impossible,
-)
 from robotid.identification.closed_loop.initial_values import (
     Encoders,
     SecondOrder,
@@ -52,10 +44,16 @@ from robotid.identification.closed_loop.initial_values import (
 from robotid.identification.closed_loop.loop_settings import LoopSettings, groups_of
 from robotid.identification.closed_loop.loop_simulator import (
     FreeParameter,
+    GainScale,
     LoopSimulator,
     TorqueRows,
+    Tried,
+    candidates,
+    choose,
     find_gains,
     free_body_parameters,
+    gain_scale,
+    impossible,
     measured_motion,
     with_terms,
 )

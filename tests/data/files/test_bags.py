@@ -1,14 +1,23 @@
-"""Bags: which topic is read, by which clock, and the commands of controllers and other topics."""
+"""Bags: topics, clocks, commands of controllers, and sensors at other stamps than joints."""
 
 import re
 import sqlite3
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.recorders import (
+    JOINT_STATE,
+    Bag1Writer,
+    Bag2Writer,
     StoragePlugin,
+    Stores,
+    get_types_from_msg,
+    get_typestore,
+    joint_state,
     messages_of,
+    to_ns,
     write_bag2,
     write_controller,
     write_idl_controller,
@@ -17,6 +26,9 @@ from helpers.recorders import (
 from mcap.writer import Writer as McapLibraryWriter
 
 from robotid.base.exceptions import DataError, SettingsError
+from robotid.cli import main
+from robotid.data.base_motion import BaseColumns, ImuFrame, quaternions_of_angles
+from robotid.data.files import bags
 from robotid.data.files.read import read_log, write_log
 from robotid.data.log import COLUMNS, Log
 from robotid.data.signal_settings import LogSource
@@ -244,3 +256,280 @@ def test_topics_of_commands_that_cannot_be_are_refused(tmp_path):
     write_log(make_log(), tmp_path / "run.csv")
     with pytest.raises(SettingsError, match=r"the topic of a bag, but run\.csv is no bag"):
         read_log(tmp_path / "run.csv", JOINTS, needs="commands", source=COMMANDS)
+
+
+ODOMETRY, IMU = "nav_msgs/msg/Odometry", "sensor_msgs/msg/Imu"
+WRENCH, LOW_STATE = "geometry_msgs/msg/WrenchStamped", "unitree_go/msg/LowState"
+LEG = ("hip", "knee")
+T = 5.0 + np.arange(40) / 100  # [s] of the joints
+S = 5.0 + np.arange(21) / 50 + 0.003  # [s] of the sensors
+BASE = BaseColumns(True)
+DEFINITION = (
+    """float32[4] quaternion
+float32[3] gyroscope
+float32[3] accelerometer
+""",
+    """float32 q
+float32 dq
+float32 tau_est
+""",
+    """unitree_go/IMUState imu_state
+unitree_go/MotorState[3] motor_state
+int16[4] foot_force
+""",
+)
+
+
+def angles(t):
+    return np.column_stack([0.3 * t, -0.2 * t, 1.0 + 0.5 * t])
+
+
+def places(t):
+    return np.column_stack([t, 2.0 - t, 0.3 + 0.1 * t])
+
+
+class Maker:
+    """Messages of a store, by type."""
+
+    def __init__(self, store):
+        self.types = get_typestore(store)
+        kinds = [f"unitree_go/msg/{x}" for x in ("IMUState", "MotorState", "LowState")]
+        for kind, text in zip(kinds, DEFINITION, strict=True):
+            self.types.register(get_types_from_msg(text, kind))
+
+    def new(self, kind, *values):
+        return self.types.types[kind](*values)
+
+    def xyz(self, values, kind="geometry_msgs/msg/Vector3"):
+        return self.new(kind, *map(float, values))
+
+    def header(self, t, frame):
+        header = joint_state(self.types, to_ns(t), [], [], [], []).header
+        header.frame_id = frame
+        return header
+
+    def quaternion(self, t):
+        q = quaternions_of_angles(angles(np.array([t])))[0] * (-1.0 if t > 5.2 else 1.0)
+        return self.new("geometry_msgs/msg/Quaternion", *q)
+
+    def odometry(self, t, shift=0.0):
+        pose = self.new(
+            "geometry_msgs/msg/Pose", self.xyz(places(t)[0] + shift, "geometry_msgs/msg/Point"),
+            self.quaternion(t),
+        )  # fmt: skip
+        twist = self.new("geometry_msgs/msg/Twist", self.xyz([t, 2, 3]), self.xyz([4, 5, t]))
+        nothing = np.zeros(36)
+        return self.new(
+            ODOMETRY, self.header(t, "odom"), "trunk",
+            self.new("geometry_msgs/msg/PoseWithCovariance", pose, nothing),
+            self.new("geometry_msgs/msg/TwistWithCovariance", twist, nothing),
+        )  # fmt: skip
+
+    def imu(self, t, known=True):
+        covariance = np.zeros(9)
+        orientation = covariance if known else np.append(-1.0, covariance[1:])
+        return self.new(
+            IMU, self.header(t, "imu_link"), self.quaternion(t), orientation,
+            self.xyz([0.1, 0.2, t]), covariance, self.xyz([t, 0.5, 9.81]), covariance,
+        )  # fmt: skip
+
+    def wrench(self, t, frame="l_sole"):
+        own = self.new("geometry_msgs/msg/Wrench", self.xyz([1, 2, 10 * t]), self.xyz([4, t, 6]))
+        return self.new(WRENCH, self.header(t, frame), own)
+
+    def low_state(self, t):
+        q = self.quaternion(t)
+        imu = self.new(
+            "unitree_go/msg/IMUState", np.array([q.w, q.x, q.y, q.z], np.float32),
+            np.array([0.1, 0.2, t], np.float32), np.array([t, 0.5, 9.81], np.float32),
+        )  # fmt: skip
+        motors = [self.new("unitree_go/msg/MotorState", t, k, k - t) for k in range(3)]
+        return self.new(LOW_STATE, imu, motors, np.array([20, 30, 40, 50], np.int16))
+
+
+def write(path, topics, store=Stores.ROS2_HUMBLE, plugin=StoragePlugin.MCAP):
+    """Write joint states and {topic: (type, {stamp: make message})}."""
+    maker, is_ros1 = Maker(store), path.suffix == ".bag"
+    types = maker.types
+    serialize = types.serialize_ros1 if is_ros1 else types.serialize_cdr
+    folder = {"version": 9, "storage_plugin": plugin}
+    with Bag1Writer(path) if is_ros1 else Bag2Writer(path, **folder) as bag:
+        for topic, (kind, stamps, make) in topics.items():
+            connection = bag.add_connection(topic, kind, typestore=types)
+            for k, t in enumerate(stamps):  # recorded one after the other, whatever their stamps
+                bag.write(connection, to_ns(5.0 + 0.01 * k), serialize(make(maker, t), kind))
+    return path
+
+
+def joints(maker, t):
+    return joint_state(maker.types, to_ns(t), LEG, [t, 2 * t], [1, 2], [3, t])
+
+
+LEG_STATES = {"/joint_states": (JOINT_STATE, T, joints)}
+ODOM = {"/odom": (ODOMETRY, S, Maker.odometry)}
+FORCE = {"/left": (WRENCH, S, Maker.wrench)}
+INERTIAL = {"/imu": (IMU, S, Maker.imu)}
+
+
+@pytest.mark.parametrize("name", ["log", "log.bag"])
+def test_odometry_is_interpolated_at_the_stamps_of_the_joints(tmp_path, name):
+    store = Stores.ROS1_NOETIC if name == "log.bag" else Stores.ROS2_HUMBLE
+    path = write(tmp_path / name, LEG_STATES | ODOM | FORCE, store)
+    log = read_log(path, LEG, base=BASE)
+    np.testing.assert_allclose(log.t, T[1:])  # the first joint state is before the odometry
+    np.testing.assert_allclose(log.q[:, 1], 2 * log.t)
+    np.testing.assert_allclose(log.base.pose[:, :3], places(log.t), atol=1e-12)
+    wanted = quaternions_of_angles(angles(log.t))
+    sign = np.sign(np.sum(log.base.pose[:, 3:] * wanted, axis=1))
+    np.testing.assert_allclose(log.base.pose[:, 3:] * sign[:, None], wanted, atol=1e-5)
+    np.testing.assert_allclose(log.base.twist[:, [0, 1, 2, 3, 4]], np.column_stack(
+        [log.t, *np.tile([[2.0], [3.0], [4.0], [5.0]], len(log.t))]))  # fmt: skip
+    np.testing.assert_allclose(log.base.twist[:, 5], log.t)
+    assert log.notes == ("interpolated at the stamps of the joints: topic '/odom'",)
+    plain = read_log(path, LEG)
+    assert len(plain.t) == len(T)
+    assert not plain.notes
+
+
+def test_wrenches_have_the_axes_of_their_frame(tmp_path):
+    path = write(tmp_path / "log", LEG_STATES | {"/left": (WRENCH, np.roll(S, 7), Maker.wrench)})
+    wanted = BaseColumns(wrenches=("fz l_sole", "my l_sole"), local=("l_sole",))
+    log = read_log(path, LEG, base=wanted)
+    np.testing.assert_allclose(log.wrenches["fz l_sole"], 10 * log.t)
+    np.testing.assert_allclose(log.wrenches["my l_sole"], log.t)
+    with pytest.raises(DataError, match=r"wrench_fz_l_sole.* axes of their frames.*axes = 'link'"):
+        read_log(path, LEG, base=BaseColumns(wrenches=("fz l_sole",)))
+
+
+@pytest.mark.parametrize(("late", "early"), [("/odom", "/left"), ("/left", "/odom")])
+def test_rows_lie_between_the_messages_of_all_topics(tmp_path, late, early):
+    stamps = {late: S, early: S - 0.1}  # 5.003 to 5.403 s, 4.903 to 5.303 s
+    topics = {"/odom": (ODOMETRY, Maker.odometry), "/left": (WRENCH, Maker.wrench)}
+    sensors = {name: (kind, stamps[name], make) for name, (kind, make) in topics.items()}
+    path = write(tmp_path / "log", LEG_STATES | sensors)
+    wanted = BaseColumns(True, wrenches=("fz l_sole",), local=("l_sole",))
+    log = read_log(path, LEG, base=wanted)
+    np.testing.assert_allclose(log.t, T[1:31])  # 5.01 to 5.30 s
+    np.testing.assert_allclose(log.wrenches["fz l_sole"], 10 * log.t)
+    np.testing.assert_allclose(log.base.pose[:, :3], places(log.t), atol=1e-12)
+
+
+def test_a_bag_is_converted_with_base_and_forces(tmp_path, capsys):
+    path, target = write(tmp_path / "log", LEG_STATES | ODOM | FORCE), tmp_path / "log.csv"
+    wanted = BaseColumns(True, wrenches=("fz l_sole", "my l_sole"), local=("l_sole",))
+    assert main(["convert", str(path), str(target), "--joints", "knee"]) == 0
+    assert "axes = 'link' in [[contact]]" in capsys.readouterr().out
+    one, other = (read_log(x, ["knee"], base=wanted) for x in (path, target))
+    np.testing.assert_array_equal(one.base.pose, other.base.pose)
+    np.testing.assert_array_equal(one.base.twist, other.base.twist)
+    np.testing.assert_array_equal(other.wrenches["fz l_sole"], one.wrenches["fz l_sole"])
+    np.testing.assert_allclose(other.wrenches["my l_sole"], other.t)
+    twice = write(tmp_path / "twice", LEG_STATES | ODOM | {"/mocap": ODOM["/odom"]})
+    assert main(["convert", str(twice), str(target)]) == 1
+    assert "log has 2 topics" in capsys.readouterr().err.replace("twice", "log")
+    assert main(["convert", str(twice), str(target), "--sensors", "/odom"]) == 0
+    np.testing.assert_allclose(read_log(target, LEG, base=BASE).base.twist[:, 1], 2.0)
+
+
+def test_one_of_several_topics_is_stated(tmp_path):
+    none = {"/mocap/odom": (ODOMETRY, S[:0], lambda m, t: m.odometry(t, 1.0))}
+    empty = read_log(write(tmp_path / "empty", LEG_STATES | ODOM | none), LEG, base=BASE)
+    np.testing.assert_allclose(empty.base.pose[:, 0], empty.t, atol=1e-9)
+    other = {"/mocap/odom": (ODOMETRY, S, lambda m, t: m.odometry(t, 1.0))}
+    path = write(tmp_path / "log", LEG_STATES | ODOM | other)
+    with pytest.raises(
+        DataError,
+        match=re.escape(
+            "log has 2 topics with base_x: /mocap/odom, /odom. State all topics of sensors to "
+            'read: sensors = ["/mocap/odom"]'
+        ),
+    ):
+        read_log(path, LEG, base=BASE)
+    assert len(read_log(path, LEG).t) == len(T)
+    for topic, shift in (("/odom", 0.0), ("/mocap/odom", 1.0)):
+        source = LogSource(sensors=(topic,))
+        log = read_log(path, LEG, base=BASE, source=source)
+        np.testing.assert_allclose(log.base.pose[:, 0], log.t + shift, atol=1e-9)
+    for topic, message in (
+        ("/odo", "no message of a topic '/odo', which sensors states"),
+        ("/joint_states", "topic '/joint_states', which sensors states, has messages of sensor_"),
+    ):
+        with pytest.raises(DataError, match=message):
+            read_log(path, LEG, source=LogSource(sensors=(topic,)))
+
+
+def test_a_bag_without_odometry_names_what_is_missing(tmp_path):
+    path = write(tmp_path / "log", LEG_STATES | INERTIAL)
+    with pytest.raises(DataError, match=r"no column base_x, .*columns of the base found: imu_qx"):
+        read_log(path, LEG, base=BASE)
+    late = {"/odom": (ODOMETRY, S + 10.0, Maker.odometry)}
+    path = write(tmp_path / "late", LEG_STATES | late)
+    with pytest.raises(DataError, match=r"no message of the joints lies between .*'/odom', 15.003"):
+        read_log(path, LEG, base=BASE)
+    never = {"/odom": (ODOMETRY, S, lambda m, t: m.odometry(0.0))}
+    path = write(tmp_path / "never", LEG_STATES | never)
+    with pytest.raises(DataError, match=r"'/odom': the header stamps of all 21 messages are 0"):
+        read_log(path, LEG, base=BASE)
+
+
+@pytest.mark.parametrize("plugin", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_a_state_of_unitree_has_motors_imu_and_feet(tmp_path, plugin):
+    path = write(tmp_path / "log", {"/lowstate": (LOW_STATE, T, Maker.low_state)}, plugin=plugin)
+    source = LogSource(joints={"hip": "0", "knee": "2"})
+    flags = BaseColumns(contacts=("a", "b"), thresholds=(25.0, 45.5))
+    columns = {"contact_a": "foot_force_0", "contact_b": "foot_force_3"}
+    log = read_log(path, LEG, base=flags, source=source, columns=columns)
+    np.testing.assert_allclose(log.t, T)
+    np.testing.assert_allclose(log.q, np.column_stack([T, T]), rtol=1e-6)
+    np.testing.assert_allclose(log.v, np.tile([0.0, 2.0], (len(T), 1)))
+    np.testing.assert_allclose(log.tau, np.column_stack([-T, 2 - T]), rtol=1e-6)
+    assert not log.contacts["a"].any()
+    assert log.contacts["b"].all()
+    log = read_log(path, LEG, base=INSIDE, source=source)
+    assert_imu(log)
+
+
+INSIDE = BaseColumns(
+    True, imu=ImuFrame(np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.zeros(3))
+)
+
+
+def assert_imu(log):
+    one = np.ones(len(log.t))
+    wanted = np.column_stack([0.1 * one, 0.2 * one, log.t, log.t, 0.5 * one, 9.81 * one])
+    np.testing.assert_allclose(log.base.imu.values, wanted, rtol=1e-6)
+    q = quaternions_of_angles(angles(log.t))
+    np.testing.assert_allclose(np.abs(np.sum(log.base.pose[:, 3:] * q, axis=1)), 1.0, atol=1e-6)
+    assert not log.base.has_position
+
+
+def test_an_imu_without_orientation_needs_that_of_the_base(tmp_path):
+    path = write(tmp_path / "log", LEG_STATES | INERTIAL)
+    assert_imu(read_log(path, LEG, base=INSIDE))
+    blind = {"/imu": (IMU, S, lambda m, t: m.imu(t, known=False))}
+    path = write(tmp_path / "blind", LEG_STATES | blind)
+    with pytest.raises(DataError, match="no column imu_qx, imu_qy, imu_qz, imu_qw of the IMU; col"):
+        read_log(path, LEG, base=INSIDE)
+    path = write(tmp_path / "both", LEG_STATES | blind | ODOM)
+    np.testing.assert_allclose(
+        read_log(path, LEG, base=INSIDE).base.pose[:, :3], places(T[1:]), atol=1e-9
+    )
+
+
+def test_a_field_of_a_controller_is_of_the_first_point_that_has_a_number():
+    """Joints without a command are NaN; the output comes before the reference."""
+    nan = float("nan")
+    message = SimpleNamespace(
+        feedback=SimpleNamespace(positions=[1.0, 2.0], velocities=[nan, nan], effort=[]),
+        actual=SimpleNamespace(positions=[9.0, 9.0], velocities=[3.0, nan], effort=[5.0, 6.0]),
+        output=SimpleNamespace(positions=[nan, nan], velocities=[nan, 7.0]),
+        reference=SimpleNamespace(positions=[0.1, nan], velocities=[8.0, 8.0], effort=[nan, nan]),
+        desired=SimpleNamespace(positions=[0.3, 0.4], velocities=[4.0, 4.0], effort=[nan, 0.5]),
+    )
+    found = bags._controlled(message)
+    np.testing.assert_array_equal(found["position"], [1.0, 2.0])
+    np.testing.assert_array_equal(found["velocity"], [3.0, nan])
+    np.testing.assert_array_equal(found["effort"], [5.0, 6.0])
+    np.testing.assert_array_equal(found["qref"], [0.1, nan])
+    np.testing.assert_array_equal(found["dqref"], [nan, 7.0])
+    np.testing.assert_array_equal(found["tauref"], [nan, 0.5])

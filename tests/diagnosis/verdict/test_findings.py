@@ -123,10 +123,3 @@ def test_errors_of_the_second_moments_allow_less_density_too():
     assert found == pytest.approx(share, abs=4 * np.sqrt(share / 2000))
     assert density_share(body, np.zeros((10, 10)), 12e3, np.random.default_rng(2)) == 0.0
     assert density_share(body, np.zeros((10, 10)), 16e3, np.random.default_rng(2)) == 1.0
-
-
-class Parameters(str):
-    """Parameters by name, whose masses are 2 and 3 kg."""
-
-    def __getitem__(self, part):
-        return np.array([2.0, 3.0])

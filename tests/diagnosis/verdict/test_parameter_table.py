@@ -112,10 +112,3 @@ def test_sets_are_joined_by_correlations_of_either_sign_and_hold_numbers_of_all_
     assert correlated_sets(C, [8, 7, 4, 2]) == [[8, 2]]
     assert correlated_sets(C, [3, 0, 5]) == [[3, 0]]
     assert correlated_sets(C, [5, 6]) == []
-
-
-def test_a_parameter_that_joins_two_sets_makes_them_one():
-    R = np.eye(5)
-    for i, k in ((0, 1), (2, 3), (1, 3)):
-        R[i, k] = R[k, i] = 0.96
-    assert correlated_sets(R, range(5)) == [[0, 1, 2, 3]]

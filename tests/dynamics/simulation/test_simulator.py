@@ -7,7 +7,7 @@ from helpers.paths import URDF
 from helpers.synthetic import truth
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.dynamics.simulation.motions import FourierTrajectory, random_fourier
+from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import (
     Actuator,
     Controller,
@@ -16,7 +16,6 @@ from robotid.dynamics.simulation.simulation_settings import (
     Sensors,
     Simulation,
     Steps,
-    Truth,
 )
 from robotid.dynamics.simulation.simulator import (
     RobotPlant,
@@ -26,37 +25,11 @@ from robotid.dynamics.simulation.simulator import (
     measure,
     simulate,
 )
-from robotid.dynamics.simulation.truth import draw_parameters
-from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.constraints import Contact
 from robotid.robot.drives import Lag, LoadFriction, LuGre, Presliding
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
-
-
-def test_a_fourier_motion_keeps_its_derivatives(rng):
-    motion = FourierTrajectory(
-        np.ones(2), rng.standard_normal((3, 2)), rng.standard_normal((3, 2)), period=4.0
-    )
-    t, h = np.linspace(0, 4, 50), 1e-5
-    q, v, a = motion.evaluate(t)
-    before, after = motion.evaluate(t - h), motion.evaluate(t + h)
-    np.testing.assert_allclose(v, (after[0] - before[0]) / (2 * h), atol=1e-6)
-    np.testing.assert_allclose(a, (after[1] - before[1]) / (2 * h), atol=1e-6)
-    np.testing.assert_allclose(motion.evaluate(t + 4.0)[0], q, atol=1e-12)
-
-
-def test_the_log_of_the_plant_obeys_its_own_equation(ur5, rng):
-    pi = truth(ur5)
-    log = simulate(ur5, pi, random_fourier(ur5, rng), rate=1000.0, duration=1.0, rng=rng)
-    a = np.gradient(log.v, log.t, axis=0)
-    tau = (joint_torque_regressor(ur5, log.q, log.v, a) @ pi).reshape(log.tau.shape)
-    smooth = (np.abs(log.v) > 0.02).all(axis=1)  # the plant's friction is tanh(v / 0.2 mm/s)
-    smooth[[0, 1, -2, -1]] = False  # one-sided differences
-    error = np.abs(tau - log.tau)[smooth].max()
-    assert error < 2e-3 * np.abs(log.tau).max()
-    np.testing.assert_allclose(np.gradient(log.q, log.t, axis=0)[5:-5], log.v[5:-5], atol=1e-3)
 
 
 def followed(model, pi, settings, *, seed=1, rate=500.0, duration=2.0):
@@ -198,21 +171,6 @@ def test_a_payload_adds_what_pinocchio_says_of_its_body(ur5):
     assert np.count_nonzero(added) == 10
     np.testing.assert_array_equal(pi, np.arange(float(len(pi))))  # as it was
     assert carried(ur5, pi, Payload("forearm_link", 0.0)) is pi
-
-
-def test_a_drive_of_several_joints_is_as_small_as_the_weakest(panda):
-    for ratios in ((("panda_joint1", 1.0), ("panda_joint7", 2.0)),
-                   (("panda_joint7", 2.0), ("panda_joint1", 1.0))):  # fmt: skip
-        model = RobotModel.from_urdf(
-            panda.tree.path, joints=panda.joints, couplings=(Coupling("motor", ratios),)
-        )
-        pi = draw_parameters(model, Truth(inertials=0.0), np.random.default_rng(3))
-        drawn = dict(zip(model.layout.names, pi, strict=True))
-        for d, term in model.layout.drive_parameters:
-            drive = model.layout.drives[d].name
-            weak = 12.0 / 50.0 if drive == "motor" or drive[-1] in "567" else 1.0
-            low, high = (weak * x for x in term.typical)
-            assert low <= drawn[f"{drive}.{term.name}"] <= high, drive
 
 
 JOINTS = ("a", "b")

@@ -3,8 +3,7 @@ import pytest
 from helpers.estimation import NOISE, Case, still_wrist
 
 from robotid.base.exceptions import DataError, RankDeficientError
-from robotid.dynamics.factors import compress
-from robotid.dynamics.problem import Problem
+from robotid.dynamics.factors import Problem, compress
 from robotid.estimation.estimators import OLS, TLS, WLS
 from robotid.estimation.estimators.batch import mixed_tls, solve_factor
 

@@ -8,7 +8,7 @@ from helpers.mujoco_plant import plant
 
 from robotid.data.log import Log
 from robotid.dynamics.simulation.loops import cut_windows
-from robotid.identification.closed_loop.further_parameters import (
+from robotid.identification.closed_loop.loop_simulator import (
     GainScale,
     _gains,
     _last,

@@ -9,8 +9,8 @@ import scipy.stats
 from robotid.data.log import Log
 from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.identification.closed_loop.from_commands import logged_motion, loop_findings
-from robotid.identification.closed_loop.further_parameters import GainScale, Tried
 from robotid.identification.closed_loop.initial_values import Encoders
+from robotid.identification.closed_loop.loop_simulator import GainScale, Tried
 
 #: Names of the unknowns, in the order of the fit.
 NAMES = ("rail.armature", "turn.armature", "robot.delay", "rail.viscous", "turn.viscous")
