@@ -16,7 +16,6 @@ from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.interior_point import Entropic
 from robotid.estimation.fitting.estimator_settings import ConstraintSettings
 from robotid.estimation.fitting.fit import make_constraints
-from robotid.robot.bodies import body_boxes
 from robotid.robot.parameters import ParameterLayout, inertial_from_pseudo_inertia, pseudo_inertia
 
 LAYOUT = ParameterLayout(bodies=("one", "two"), joints=("a", "b"), terms=("viscous",))
@@ -189,26 +188,6 @@ def test_the_slabs_of_a_box_hold_for_grains_inside_and_fail_for_one_outside(rng)
     np.testing.assert_array_equal(np.sign(np.einsum("kij,i,j->k", slabs(box), x, x)), [-1, 1, 1])
 
 
-def test_extents_keep_the_mass_of_each_body_in_its_box(case, ur5):
-    boxes = {b: 0.2 * box + 0.8 * box.mean(axis=0) for b, box in body_boxes(ur5).items()}
-    loose, factors = case
-    tight = replace(loose, constraints=Constraints(extent=boxes))
-    free, kept = (one.fit(factors) for one in (loose, tight))
-
-    def slack(estimate):
-        J = pseudo_inertia(estimate.theta[:60])
-        return np.array(
-            [np.einsum("kij,ij->k", slabs(boxes[b]), J_i) for b, J_i in zip(boxes, J, strict=True)]
-        )
-
-    assert slack(free).min() < -1e-3
-    assert slack(kept).min() > -1e-7
-    bound = [b for b, values in zip(boxes, slack(kept), strict=True) if values.min() < 1e-7]
-    assert [f"extent {body}" for body in sorted(bound)] == [
-        label for label in kept.details["active"] if label.startswith("extent")
-    ]
-
-
 @pytest.fixture(scope="module")
 def two_bodies():
     """Two bodies of 3 and 5 kg; the first has 1 kg on locked joints."""
@@ -284,15 +263,6 @@ def test_the_spread_before_the_data_is_that_of_the_plausible_weight(two_bodies):
         )
         np.testing.assert_allclose(fit.spread_before, spread, rtol=1e-9)
         assert fit.weight_ratio == max(weight / plausible, 1.0)
-
-
-def test_consistent_fit_is_physical_where_least_squares_is_not(ur5, rng):
-    case = Case(ur5, rng, 40 * NOISE, samples=200)
-    free = case.mapping.to_standard(WLS().fit(case.problem).theta, ur5.standard_parameters())
-    assert np.linalg.eigvalsh(pseudo_inertia(free[:60])).min() < 0
-    estimate = consistent(case).fit(case.problem)
-    assert np.linalg.eigvalsh(pseudo_inertia(estimate.theta[:60])).min() > 0
-    assert (estimate.theta[ur5.layout.is_nonnegative()] >= 0).all()
 
 
 def test_a_prior_that_is_not_finite_is_refused(ur5, rng):

@@ -16,7 +16,7 @@ from robotid.estimation.fitting.drive_terms import OpenTerm
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.fitted import Fit, expected_band, friction_curve, next_errors
-from robotid.estimation.fitting.standard_errors import TorqueBand, rms_error, torque_band
+from robotid.estimation.fitting.standard_errors import TorqueBand, rms_error
 from robotid.robot.drives import LoadFriction, PositionCoulomb
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -34,21 +34,6 @@ def found(request, ur5):
     settings = SignalSettings(cutoff=None, trim=0.0)
     estimator = EstimatorSettings(request.param)
     return identify(ur5, [fitted], validation=[kept], signals=settings, estimator=estimator), pi
-
-
-def test_a_band_is_the_spread_of_predictions_of_parameters_drawn_from_the_covariance(ur5, found):
-    identification, _ = found
-    (evaluation,) = identification.validation
-    motion = evaluation.recording.trajectory
-    K = identification.mapping.K
-    C = K @ identification.standard_covariance @ K.T
-    band = torque_band(ur5, identification.mapping, motion, C, np.zeros(6))
-    rng = np.random.default_rng(0)
-    drawn = rng.multivariate_normal(np.zeros(len(C)), C, size=4000, method="svd")
-    k = band.samples[[10, 200]]
-    W = joint_torque_regressor(ur5, motion.q[k], motion.v[k], motion.a[k])
-    spread = (W[:, identification.mapping.independent] @ drawn.T).std(axis=1).reshape(2, 6)
-    np.testing.assert_allclose(band.parameters[[10, 200]], spread, rtol=0.06)
 
 
 def test_bands_hold_95_percent_of_the_torques_of_a_new_motion(found):

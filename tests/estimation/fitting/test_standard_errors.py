@@ -110,10 +110,12 @@ def test_an_open_parameter_has_no_error_and_leaves_that_of_others(W):
     np.testing.assert_allclose(found, others, rtol=1e-9)
 
 
-def test_scores_scatter_as_the_matrices_of_their_rows_say(W):
-    """Of two joints and four columns, one of which a single segment has nearly alone."""
+@pytest.mark.parametrize("rest", [1.0, 0.0])
+def test_scores_scatter_as_the_matrices_of_their_rows_say(W, rest):
+    """Of two joints and four columns, one of which a single segment has nearly, or quite alone."""
     W = W.copy()
-    W[:60, :, 2] *= 30.0
+    W[:60] *= [rest, rest, 30.0, rest]
+    W[60:, :, 2] *= rest
     tau = W @ TRUTH + 2.0 * noise(np.random.default_rng(8), 0.9)
     sigma = np.array([1.5, 0.2])
     rows, y = (x / sigma[:, None] for x in (W, tau[:, :, None]))
@@ -139,7 +141,13 @@ def test_scores_scatter_as_the_matrices_of_their_rows_say(W):
     np.testing.assert_allclose(found.meat, meat + left / expected * alone, rtol=1e-6)
     assert alone[2, 2] > 0.3 / B[2, 2]
     np.testing.assert_allclose(found.covariance, B @ found.meat @ B, rtol=1e-6)
-    for k in range(4):
+    if not rest:
+        assert found.freedom()[2] == 1.0
+        prior = B + np.diag([0.0, 0.0, 0.0, 1e4])  # and a parameter that no row has
+        prior[3, :3] = prior[:3, 3] = 0.0
+        freedom = scatter(segments(W * [1, 1, 1, 0], tau), theta, sigma, prior).freedom()
+        assert np.isinf(freedom).tolist() == [False, False, False, True]
+    for k in range(4) if rest else (0, 1, 3):
         back = np.array([R.T @ x[:, k] for R, x in zip(X, a, strict=True)])
         gram = np.diag([x[:, k] @ x[:, k] for x in a]) - back @ B @ back.T
         wanted = np.trace(gram) ** 2 / np.sum(gram**2)
