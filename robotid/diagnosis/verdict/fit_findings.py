@@ -348,7 +348,7 @@ def _cure(fit: Fit, body: str, excess: float = 0.0) -> str:
     """Return what to correct for an impossible body."""
     cure = "Record motion about more axes, or pin it to the URDF"
     for stated, mass in _stated_of(fit, body).items():
-        limit = f" (possible: up to about {mass - excess:.3g} kg)" if excess > 0 else ""
+        limit = f" (possible: up to about {mass - excess:.3g} kg)" * (excess > 0)
         cure = f"Check the stated {stated} of {mass:.4g} kg{limit}: weigh it, or remove it"
     return cure
 
@@ -372,10 +372,10 @@ def _of_outliers(fit: Fit) -> Finding:
         f"{o.predicted:.4g}, residual {o.size:.0f} times the typical one"
         for o in outliers[:NAMED]
     ) + f"; and {more} more" * (more > 0)
-    count = f"{len(outliers)} outlier{'s' if len(outliers) > 1 else ''}"
     return finding(
-        "outliers", "", outliers[0].joint, count=count, where=places,
-        cure=fit.estimator.is_robust, places=len(outliers), largest=outliers[0].size,
+        "outliers", "", outliers[0].joint, where=places, cure=fit.estimator.is_robust,
+        count=f"{len(outliers)} outlier{'s' * (len(outliers) > 1)}", places=len(outliers),
+        largest=outliers[0].size,
     )  # fmt: skip
 
 
