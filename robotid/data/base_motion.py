@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from robotid.base.exceptions import DataError
 from robotid.base.findings import listed
-from robotid.base.typing import Array, real_numbers
+from robotid.base.typing import Array, frozen, real_numbers
 
 #: Names of the coordinates of a pose: position [m], and the orientation as a quaternion.
 POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -98,8 +98,7 @@ class BaseMotion:
             )
         pose = self.pose.copy()
         pose[:, 3:] *= continuous_signs(pose[:, 3:]) / sizes[:, None]
-        pose.flags.writeable = False
-        object.__setattr__(self, "pose", pose)
+        object.__setattr__(self, "pose", frozen(pose))
 
     def at(self, rows: slice) -> "BaseMotion":
         """Return some samples."""
@@ -357,13 +356,12 @@ def quaternions_of_angles(angles: Array) -> Array:
 
 
 def _checked(values: ArrayLike, name: str, width: int) -> Array:
-    array: Array = real_numbers(values, f"{name} of the base").copy()
+    array = real_numbers(values, f"{name} of the base")
     if array.ndim != 2 or array.shape[1] != width:
         raise DataError(f"{name} of the base has shape {array.shape}, wanted (N, {width})")
     if not np.isfinite(array).all():
         row = int(np.argmin(np.isfinite(array).all(axis=1)))
         raise DataError(f"{name} of the base is not finite in row {row}")
-    array.flags.writeable = False
     return array
 
 

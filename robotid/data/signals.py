@@ -14,7 +14,7 @@ from scipy.linalg.lapack import dtbtrs
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.text import seconds
-from robotid.base.typing import Array
+from robotid.base.typing import Array, frozen
 from robotid.data.base_motion import GAP_STEPS, base_state, pose_jumps
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
@@ -524,9 +524,7 @@ def butterworth_poles(order: int, cutoff: float, rate: float) -> Array:
     """Return the ceil(order / 2) poles of a Butterworth low-pass, by the bilinear transform."""
     angles = np.pi * (2 * np.arange((order + 1) // 2) + order + 1) / (2 * order)
     analog = np.tan(np.pi * cutoff / rate) * np.exp(1j * angles)
-    poles = np.asarray((1 + analog) / (1 - analog))
-    poles.flags.writeable = False
-    return poles
+    return frozen((1 + analog) / (1 - analog), np.complex128)
 
 
 def zero_phase(x: Array, order: int, cutoff: float, rate: float, pad: int) -> Array:

@@ -462,5 +462,4 @@ def _shape_points(shape: Shape, urdf: Path) -> Array | None:
 
 
 def _moved(points: Array, H: Array) -> Array:
-    moved: Array = points @ H[:3, :3].T + H[:3, 3]
-    return moved
+    return np.asarray(points @ H[:3, :3].T + H[:3, 3])

@@ -254,8 +254,7 @@ def pseudo_inertia_basis() -> Array:
         basis[k, axis, axis] = -0.5
     for k, (i, j) in ((5, (0, 1)), (7, (0, 2)), (8, (1, 2))):
         basis[k, i, j] = basis[k, j, i] = -1.0
-    basis.flags.writeable = False
-    return basis
+    return frozen(basis)
 
 
 def pseudo_inertia(pi: Array) -> Array:

@@ -49,8 +49,7 @@ PARQUET = Format((".parquet",), _open, _write, written=(".parquet",))
 
 def load_pyarrow(purpose: str) -> ModuleType:
     """Return pyarrow, with pyarrow.parquet imported."""
-    package: ModuleType = load_package(purpose, "parquet", "pyarrow", "pyarrow.parquet")[0]
-    return package
+    return load_package(purpose, "parquet", "pyarrow", "pyarrow.parquet")[0]
 
 
 @dataclass(frozen=True)

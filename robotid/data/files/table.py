@@ -9,6 +9,7 @@ from functools import cache, cached_property, partial
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Protocol, TypeGuard
 
 import numpy as np
@@ -287,7 +288,7 @@ def choose(where: str, candidates: Sequence[str], noun: str, listing: str) -> st
     )
 
 
-def load_package(purpose: str, extra: str, *modules: str) -> list[Any]:
+def load_package(purpose: str, extra: str, *modules: str) -> list[ModuleType]:
     """Return modules of a package that an extra of robotid installs."""
     try:
         return [import_module(name) for name in modules]

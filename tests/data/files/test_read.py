@@ -15,7 +15,7 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.data.base_motion import BaseColumns
 from robotid.data.files.columns import quantity_of
 from robotid.data.files.read import lay_out, read_log, read_logs, write_columns, write_log
-from robotid.data.log import Log
+from robotid.data.log import COLUMNS, Log
 from robotid.data.signal_settings import LogSource, LogUnits, Transmission
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -442,14 +442,18 @@ OFFSET, EFFICIENCY = np.array([0, 0.3, -1.2]), np.array([0.8, 0.9, 0.7])
 
 @pytest.fixture
 def motion(rng):
-    """Positions, speeds and torques of the joints, by kind."""
-    return {kind: rng.uniform(-1, 1, (20, 3)) for kind in ("q", "dq", "tau")}
+    """Positions, speeds and torques of the joints and their commands, by kind."""
+    kinds = [f"{kind}{ref}" for ref in ("", "ref") for kind in ("q", "dq", "tau")]
+    return {kind: rng.uniform(-1, 1, (20, 3)) for kind in kinds}
 
 
 def motor_side(motion):
-    """What motors do that drive the joints so: w = T v, q_m = GEARS (q - q_0), power passes."""
-    tau_m = np.linalg.solve(GEARS.T, motion["tau"].T).T / EFFICIENCY
-    moved = {"qm": (motion["q"] - OFFSET) @ GEARS.T, "dqm": motion["dq"] @ GEARS.T, "taum": tau_m}
+    """What motors do that drive the joints so: w = T v, q_m = T (q - q_0), power passes."""
+    moved = {}
+    for ref in ("", "ref"):
+        moved[f"q{ref}m"] = (motion[f"q{ref}"] - OFFSET) @ GEARS.T
+        moved[f"dq{ref}m"] = motion[f"dq{ref}"] @ GEARS.T
+        moved[f"tau{ref}m"] = np.linalg.solve(GEARS.T, motion[f"tau{ref}"].T).T / EFFICIENCY
     return {"time": np.arange(20) / 100} | {
         f"{kind}_m{i + 1}": x[:, i] for kind, x in moved.items() for i in range(3)
     }
@@ -463,10 +467,10 @@ def save(path, table):
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_motor_columns_become_those_of_the_joints(tmp_path, motion, suffix):
     path = save(tmp_path / f"run{suffix}", motor_side(motion))
-    log = read_log(path, DRIVEN, transmissions=MOTORS)
+    log = read_log(path, DRIVEN, transmissions=MOTORS, needs="commands")
     assert log.notes == ()
-    for kind, values in (("q", log.q), ("dq", log.v), ("tau", log.tau)):
-        np.testing.assert_allclose(values, motion[kind], atol=1e-12)
+    for kind, values in motion.items():
+        np.testing.assert_allclose(getattr(log, COLUMNS[kind]), values, atol=1e-12)
     # without losses, the motors give the power that the joints take
     table, lossless = motor_side(motion), Transmission(**WRIST)
     own = read_log(path, DRIVEN, transmissions=(MOTORS[0], lossless))
@@ -612,25 +616,6 @@ def test_no_two_quantities_share_a_name():
     for unread in ("target_current_0", "tau_q_elbow", "q_"):
         assert quantity_of(unread) is None
     assert quantity_of("effort_command_elbow", "current") is None
-
-
-def test_commands_of_motors_pass_the_gears():
-    log, A = COMMANDED, np.array([[2.0, 0.0], [1.0, -3.0]])  # w = A v
-    gear = Transmission(
-        joints=JOINTS,
-        matrix=A.tolist(),
-        motors=("a", "b"),
-        efficiency=(0.9, 0.7),
-        offset=(0.1, 0.2),
-    )
-    table = {"time": log.t, **of("q", log.q)}
-    table |= dict(zip(("qrefm_a", "qrefm_b"), ((log.q_ref - [0.1, 0.2]) @ A.T).T, strict=True))
-    table |= dict(zip(("dqrefm_a", "dqrefm_b"), (log.v_ref @ A.T).T, strict=True))
-    turned = np.linalg.solve(A.T, log.tau_ref.T).T / [0.9, 0.7]
-    table |= dict(zip(("taurefm_a", "taurefm_b"), turned.T, strict=True))
-    back = read_log(pd.DataFrame(table), JOINTS, needs="commands", transmissions=[gear])
-    for name in ("q", "q_ref", "v_ref", "tau_ref"):
-        np.testing.assert_allclose(getattr(back, name), getattr(log, name), atol=1e-14)
 
 
 def test_what_is_not_needed_is_not_read():
