@@ -10,7 +10,7 @@ import numpy as np
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.files import missing_file
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.settings import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -21,7 +21,6 @@ from robotid.base.settings import (
     setting,
 )
 from robotid.base.typing import Array
-from robotid.data.log import suggestion
 from robotid.data.signal_settings import or_false
 
 #: A number for every joint, or numbers by joint; other joints have the default.

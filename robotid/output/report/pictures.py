@@ -4,10 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robotid.base.exceptions import DataError
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.settings import require_kind
 from robotid.base.typing import Array
-from robotid.data.log import suggestion
 from robotid.diagnosis.residual.torque_split import (
     Dependence,
     JointTorque,

@@ -17,7 +17,7 @@ from robotid.output.viewer.replays import (
     robot_scene,
     thin,
 )
-from robotid.robot.geometry import Surface
+from robotid.robot.bodies import Surface
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
