@@ -23,11 +23,11 @@ from typing import Any
 import numpy as np
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.settings import SIZE, is_number, require_kind
 from robotid.base.typing import Array
 from robotid.data.files.read import Readable
-from robotid.data.log import Log, suggestion
+from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import low_pass
 from robotid.diagnosis.logs.check_logs import excitation_finding

@@ -15,10 +15,10 @@ import numpy as np
 import pinocchio as pin
 
 from robotid.base.exceptions import DataError, ModelError
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.typing import Array
 from robotid.data.base_motion import BaseColumns, ImuFrame
-from robotid.data.log import Trajectory, suggestion
+from robotid.data.log import Trajectory
 from robotid.data.signal_settings import BaseSource
 from robotid.dynamics.factors import RowSource
 from robotid.robot.constraints import Contact, frame_id

@@ -230,18 +230,6 @@ def test_it_is_written_and_read_back(model, term, rng, tmp_path):
         assert f'{term.dynamics}="{value}"' in (tmp_path / "arm.urdf").read_text()
 
 
-def test_the_layout_knows_its_sign_size_and_preference(model, term):
-    layout, drives = model.layout, drive_part(model)
-    assert set(layout.is_nonnegative()[drives]) == {term.is_nonnegative}
-    assert set(layout.preference()[drives]) == {term.preference}
-    assert set(layout.scales(0.5)[drives]) == {0.25 if term.is_inertia else 1.0}
-    assert [name.split(".")[0] for name in layout.drive_names] == [
-        *JOINTS, *(["motor"] if term.is_shared else []),
-    ]  # fmt: skip
-    assert {found for _, found in layout.drive_parameters} == {term}
-    np.testing.assert_array_equal(layout.drive_loads, R[: len(layout.drives)].T)
-
-
 def test_terms_of_one_drive_stand_side_by_side():
     own = {"elbow_joint": [LoadFriction(), Tanh(speed=0.2)], "motor": [Cubic()]}
     model = RobotModel.from_urdf(
@@ -316,16 +304,9 @@ def test_a_late_torque_is_to_first_order_its_rate(rng):
     motion = random_fourier(model, rng)
     q, v, a = motion.evaluate(t)
     x = Trajectory(
-        t=t,
-        q=q,
-        v=v,
-        a=a,
-        tau=0 * q,
-        joints=JOINTS,
-        rate=200.0,
-        segment=np.zeros(600, dtype=int),
-        direction=np.tanh(v @ R[:3].T / 0.3),
-    )
+        t=t, q=q, v=v, a=a, tau=0 * q, joints=JOINTS, rate=200.0,
+        segment=np.zeros(600, dtype=int), direction=np.tanh(v @ R[:3].T / 0.3),
+    )  # fmt: skip
     with_lag = predict(model, [pi], remember(model, x))[0]
     punctual = replace(x, memory=np.zeros((600, 3)))
     on_time = predict(model, [pi], punctual)[0]

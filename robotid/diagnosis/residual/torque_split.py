@@ -194,11 +194,9 @@ class JointTorque:
     def cause(self) -> tuple[str, str]:
         """The cause of the residual, and what to do."""
         rms, best = self.rms, self._best(self.follows)
-        name, where, slow = "", 0.0, False
-        if best is not None:
-            name, where = best.name, best.where
-        if name == "speed":
-            slow = abs(where) < _SLOW * self.size(self.quantities["speed"][1])
+        name, where = ("", 0.0) if best is None else (best.name, best.where)
+        is_speed = name == "speed"
+        slow = is_speed and abs(where) < _SLOW * self.size(self.quantities["speed"][1])
         quick = self.broadband or 0.0
         kinds = {
             "unused": bool(np.isnan(rms["measured"])),

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.files import missing_file
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.settings import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -22,7 +22,6 @@ from robotid.base.settings import (
     setting,
 )
 from robotid.base.typing import Array
-from robotid.data.log import suggestion
 from robotid.data.signal_settings import or_false
 
 #: A number for every joint, or numbers by joint; other joints have the default.

@@ -8,9 +8,9 @@ import numpy as np
 import pinocchio as pin
 
 from robotid.base.exceptions import DataError, ModelError, NotConvergedError, SettingsError
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.typing import Array, ProgressCallback, ignore_progress
-from robotid.data.log import Log, Trajectory, suggestion
+from robotid.data.log import Log, Trajectory
 from robotid.dynamics.simulation.motions import Motion
 from robotid.dynamics.simulation.simulation_settings import (
     Actuator,

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.settings import is_number, require_kind
 from robotid.base.typing import Array, real_numbers
-from robotid.data.log import suggestion
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors
 from robotid.dynamics.friction_projection import (

@@ -10,7 +10,7 @@ from helpers.paths import DOCS
 
 from robotid.diagnosis.urdf.inspection import inspect_urdf
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.robot import geometry
+from robotid.robot import bodies
 from robotid.robot.examples import example_urdfs
 from robotid.robot.model import RobotModel
 
@@ -32,7 +32,7 @@ def inspections():
     chosen = [path for path in example_urdfs() if WRITES or path.stem not in LARGE]
     assert WRITES or len(chosen) == 69 - len(LARGE)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(geometry, "read_surfaces", lru_cache(128)(geometry.read_surfaces))
+        patch.setattr(bodies, "read_surfaces", lru_cache(128)(bodies.read_surfaces))
         return {path: inspect_urdf(path) for path in chosen}
 
 
