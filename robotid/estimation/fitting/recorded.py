@@ -444,12 +444,9 @@ def _close_looks(first: int, stop: int) -> list[tuple[int, int]]:
 
 
 def _positions(
-    names: Mapping[str, str],
-    windows: Sequence[Mapping[str, Array]],
-    layout: LogLayout,
-    model: RobotModel,
-    inside: slice = slice(None),
-) -> dict[str, Array]:
+    names: Mapping[str, str], windows: Sequence[Mapping[str, Array]], layout: LogLayout,
+    model: RobotModel, inside: slice = slice(None),
+) -> dict[str, Array]:  # fmt: skip
     """Return the positions of locked joints in the rows read, by joint [rad or m]."""
     revolute = {joint.name for joint in model.tree.movable if joint.type != "prismatic"}
     positions = {}
