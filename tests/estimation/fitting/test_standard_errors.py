@@ -48,7 +48,9 @@ def fitted(W, tau, share=1.0, count=STRETCHES):
 
 def test_an_open_parameter_has_no_error_and_leaves_that_of_others(W):
     parts, whole, rough = fitted(W, W @ TRUTH + noise(np.random.default_rng(3), 0.5))
-    wanted = measured_errors(rough, parts, whole, 1.0, np.eye(4), rough.sigma)[0].covariance
+    plain, errors = measured_errors(rough, parts, whole, 1.0, np.eye(4), rough.sigma)
+    np.testing.assert_allclose(errors.quantile, scipy.stats.t.ppf(0.975, errors.freedom))
+    wanted = plain.covariance
     R = whole.weighted(rough.sigma)[:4, :4]
     bread = np.linalg.inv(R.T @ R)
     meat = scatter(parts, rough.theta, rough.sigma, bread).meat
