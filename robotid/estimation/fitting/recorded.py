@@ -539,7 +539,8 @@ class Recordings:
                 keep_inertial_rows(self.model, log.whole.trajectory)
             motions = enumerate(log.whole.trajectory for log in self.fitted)
             if not is_cut:
-                return tuple((Reduction.of(self.problem_of(k, m), m),) for k, m in motions)
+                factors = ((compress(self.problem_of(k, motion)), motion) for k, motion in motions)
+                return tuple((Reduction(R, m.squares, len(m.t)),) for R, m in factors)
             return tuple(tuple(self._segments(k, motion)) for k, motion in motions)
         work = partial(reduce_piece, mapping=self.mapping)
         by_piece = (self.plan or WorkPlan()).map(work, self.pieces, "reducing")
