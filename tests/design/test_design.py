@@ -109,18 +109,27 @@ def test_a_search_near_the_limits_continues_beyond_them_and_a_stalled_one_restar
         assert np.array_equal(after.iterate, C) == continues
 
 
-def test_what_is_known_already_is_not_asked_for_again(designer, design):
-    rows = designer.information.rows(*(design.motion.evaluate(np.linspace(0, 4.0, 61))))
-    told = designer.matrix(rows)
+@pytest.fixture(scope="module")
+def told(designer, design):
+    """The information of a design and the prior's."""
+    return information_of(designer, design) + np.eye(len(designer.spread))
+
+
+def information_of(designer, design):
+    """Return the information of a motion itself, without the prior's."""
+    rows = designer.information.rows(*design.motion.evaluate(np.linspace(0, 4.0, 421)))
+    return designer.matrix(rows, 4.0 / 420) - designer.known
+
+
+def test_what_is_known_already_is_not_asked_for_again(designer, design, told):
     next_one = replace(designer, known=told)
     again = next_one._objective(design.motion.coefficients)
     fresh = next_one.design(np.random.default_rng(4), starts=1)
     assert fresh.objective < again - 0.02
     # its condition is that of the motion itself, without what was known before
-    rows = designer.information.rows(
-        *fresh.motion.evaluate(np.linspace(0, 4.0, fresh.intervals + 1))
-    )
-    own = designer.matrix(rows, 4.0 / fresh.intervals) - np.eye(len(told))
+    t = np.linspace(0, 4.0, fresh.intervals + 1)
+    rows = designer.information.rows(*fresh.motion.evaluate(t))
+    own = designer.matrix(rows, 4.0 / fresh.intervals) - designer.known
     assert fresh.condition == pytest.approx(np.sqrt(np.linalg.cond(own)), rel=1e-6)
 
 
@@ -137,22 +146,15 @@ def test_an_earlier_run_is_known_with_its_own_noise_in_units_of_the_spread(wrist
     np.testing.assert_allclose(after.known, np.eye(b) + S[:, None] * told * S, rtol=1e-9)
 
 
-def test_a_motion_after_another_narrows_what_that_one_left_wide(designer, design):
-    rows = designer.information.rows(*(design.motion.evaluate(np.linspace(0, 4.0, 61))))
-    told = designer.matrix(rows)
-    after = replace(designer, known=told, name="widest")
-    before = np.diag(np.linalg.inv(told))
+def test_a_motion_after_another_narrows_what_that_one_left_wide(designer, design, told):
+    after, before = replace(designer, known=told, name="widest"), np.diag(np.linalg.inv(told))
     widest = after.widest
     assert len(widest) == round(len(told) / 4)
     assert before[widest].min() >= np.delete(before, widest).max()
     found, usual = (some.design(np.random.default_rng(7), starts=1) for some in (after, designer))
-
-    def left(F):
-        return np.mean(np.log(np.diag(np.linalg.inv(F))[widest]))
-
     again, fresh, own = (
-        left(told + designer.matrix(designer.information.rows(*x)) - np.eye(len(told)))
-        for x in (some.motion.evaluate(np.linspace(0, 4.0, 61)) for some in (design, usual, found))
+        np.mean(np.log(np.diag(np.linalg.inv(told + information_of(designer, x)))[widest]))
+        for x in (design, usual, found)
     )
     assert own < fresh - 0.02
     assert own < again - 0.1

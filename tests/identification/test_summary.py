@@ -1,10 +1,16 @@
 """What a notebook and print() show of a result."""
 
+import pytest
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli.identify import identify
-from robotid.identification.summary import error_lines, friction_lines, verdict_lines
+from robotid.identification.summary import (
+    error_lines,
+    friction_lines,
+    one_more_gain,
+    verdict_lines,
+)
 from robotid.robot.model import RobotModel
 
 
@@ -60,6 +66,12 @@ def test_friction_is_said_from_the_first_step_to_the_last_that_was_taken():
         "  c: lag (held-out error 20.0 -> 8.0 %)",
     ]
     assert friction_lines({"b": joints["b"]}) == []
+
+
+def test_one_more_log_narrows_the_next_interval_by_a_share_of_its_width():
+    more = {"std_error": 0.8, "interval_width": 3.0}
+    found = one_more_gain({"std_error": 1.0, "next_interval": [-1.0, 3.0], "one_more": more})
+    assert found == pytest.approx((0.2, 0.25))
 
 
 def test_a_reason_of_a_joint_is_shown_once():
