@@ -21,7 +21,7 @@ from robotid.design.design import Multipliers
 from robotid.design.information import criterion
 from robotid.design.limits import LIMITS
 from robotid.data.log import Trajectory
-from robotid.dynamics.compiled import tree_lanes
+from robotid.dynamics.rows import tree_lanes
 
 FINE = 30  # ten times 3 times the grid of the first rounds
 

@@ -35,7 +35,7 @@ from robotid.data.files.read import write_columns
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.diagnosis.logs.command_channels import check_commands
-from robotid.dynamics.simulation.truth import another_robot
+from robotid.dynamics.simulation.simulator import another_robot
 from robotid.robot.examples import example_urdf
 from robotid.robot.parameters import INERTIAL_TERMS
 

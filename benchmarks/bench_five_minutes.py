@@ -23,9 +23,9 @@ import numpy as np
 from setting import machine
 
 from robotid.data.files.read import write_columns
-from robotid.dynamics.prediction import predict_instants
 from robotid.dynamics.simulation.motions import random_fourier
-from robotid.dynamics.simulation.truth import another_robot
+from robotid.dynamics.simulation.simulator import another_robot
+from robotid.dynamics.torque import predict_instants
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling

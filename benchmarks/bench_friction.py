@@ -27,12 +27,12 @@ from robotid.cli.identify import identify
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
-from robotid.dynamics.prediction import remember
-from robotid.dynamics.prediction import predict
+from robotid.dynamics.torque import remember
+from robotid.dynamics.torque import predict
 from robotid.robot.drive_term import DriveMotion
 from robotid.robot.drives import LoadFriction, Stribeck
 from robotid.robot.drives import AUTO
-from robotid.dynamics.simulation.truth import another_robot
+from robotid.dynamics.simulation.simulator import another_robot
 from robotid.dynamics.simulation.motions import random_fourier
 
 JOBS = Path(__file__).parents[1] / "tests" / "jobs"

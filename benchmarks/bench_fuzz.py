@@ -25,12 +25,11 @@ from setting import machine
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
-from helpers.hostile_arguments import ARGUMENT_KINDS
 from helpers.hostile_commands import COMMAND_KINDS
 from helpers.hostile_inputs import KINDS as INPUT_KINDS
 from hypothesis import HealthCheck, Phase, given, seed, settings
 
-KINDS = INPUT_KINDS | COMMAND_KINDS | ARGUMENT_KINDS
+KINDS = INPUT_KINDS | COMMAND_KINDS
 SLOW = ("values, identified", "result.json", "loop of a job")
 LONGEST = 60  # [s] for one input
 MEMORY = 8 * 2**30  # [bytes] of a process

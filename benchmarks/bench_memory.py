@@ -26,7 +26,7 @@ import pyarrow.parquet
 from setting import machine
 
 from robotid.dynamics.simulation.motions import random_fourier
-from robotid.dynamics.simulation.truth import another_robot
+from robotid.dynamics.simulation.simulator import another_robot
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -33,7 +33,7 @@ from robotid.design.previews import preview
 from robotid.data.log import Log
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
-from robotid.dynamics.simulation.truth import another_robot
+from robotid.dynamics.simulation.simulator import another_robot
 from robotid.dynamics.simulation.motions import random_fourier
 
 RATE, DURATION = 200.0, 20.0

@@ -21,9 +21,9 @@ import scipy
 import robotid
 from robotid.data.log import Trajectory
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.problem import Problem, Sample
+from robotid.dynamics.factors import Problem, Sample
 from robotid.dynamics.simulation.motions import random_fourier
-from robotid.dynamics.simulation.truth import another_robot
+from robotid.dynamics.simulation.simulator import another_robot
 from robotid.dynamics.torque import (
     InstantRegressor,
     build_problem,

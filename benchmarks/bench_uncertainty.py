@@ -39,7 +39,7 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.data.signal_settings import SignalSettings
-from robotid.dynamics.simulation.truth import another_robot
+from robotid.dynamics.simulation.simulator import another_robot
 from robotid.estimation.estimators.estimator import quantile
 
 CHAINS = {"filtered": SignalSettings(), "raw": SignalSettings(cutoff=None)}

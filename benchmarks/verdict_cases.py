@@ -17,9 +17,8 @@ import pinocchio as pin
 import scipy.linalg
 import scipy.signal
 
-from robotid.robot.bodies import held_parameters, least_density
+from robotid.robot.bodies import body_points, held_parameters, least_density
 from robotid.robot.examples import example_urdf
-from robotid.robot.geometry import body_points
 from robotid.robot.model import GRAVITY, RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 

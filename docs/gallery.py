@@ -24,10 +24,9 @@ from robotid.cli.demo import run_demo
 from robotid.cli.identify import run_job
 from robotid.cli.job import read_job
 from robotid.dynamics.simulation.motions import random_fourier
-from robotid.dynamics.simulation.simulator import Noise, simulate
-from robotid.dynamics.simulation.truth import another_robot
+from robotid.dynamics.simulation.simulator import Noise, another_robot, simulate
+from robotid.robot.bodies import link_clouds
 from robotid.robot.examples import example_urdf
-from robotid.robot.geometry import link_clouds
 
 ROOT = Path(__file__).parents[1]
 GALLERY = ROOT / "build" / "gallery"

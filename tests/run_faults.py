@@ -27,6 +27,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 TIMEOUT = 600  # [s] tests that take longer show nothing
 COPIED = ("robotid", "tests", "urdf", "docs", "benchmarks", "README.md", "pyproject.toml")
+EMPTY = "4b825dc642cb6eb9a060e54bf8d69288fbee4904"  # git's tree without files
 OPERATORS = re.compile(r"/(Replace(Bin|Un|Comp|And|Or|True|False)|NumberReplacer|AddNot)")
 
 
@@ -104,22 +105,15 @@ def mutations(count: int, since: str | None, only: str, rng: random.Random) -> I
 
 
 def changed_lines(since: str | None) -> list[tuple[str, int]]:
-    """Return (file, line) of each line inside a function that changed since a commit."""
-    if since is None:
-        pairs = [
-            (str(path.relative_to(ROOT)), k + 1)
-            for path in sorted((ROOT / "robotid").rglob("*.py"))
-            for k in range(len(path.read_text().splitlines()))
-        ]
-    else:
-        command = ["git", "diff", "-U0", since, "--", "robotid/*.py"]
-        run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-        pairs, file = [], ""
-        for row in run.stdout.splitlines():
-            if row.startswith("+++ "):
-                file = row.removeprefix("+++ b/")
-            elif hunk := re.match(r"@@ -\S+ \+(\d+)(?:,(\d+))? @@", row):
-                pairs += [(file, int(hunk[1]) + k) for k in range(int(hunk[2] or 1))]
+    """Return (file, line) of each line inside a function that changed since a commit, or of all."""
+    command = ["git", "diff", "-U0", since or EMPTY, "--", "robotid/*.py"]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    pairs, file = [], ""
+    for row in run.stdout.splitlines():
+        if row.startswith("+++ "):
+            file = row.removeprefix("+++ b/")
+        elif hunk := re.match(r"@@ -\S+ \+(\d+)(?:,(\d+))? @@", row):
+            pairs += [(file, int(hunk[1]) + k) for k in range(int(hunk[2] or 1))]
     return [(file, k) for file, k in pairs if line_of((ROOT / file).read_text(), k)[:4] == "    "]
 
 

@@ -8,18 +8,16 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from helpers.hostile_arguments import ARGUMENT_KINDS
 from helpers.hostile_commands import COMMAND_KINDS
 from helpers.hostile_inputs import KINDS as INPUT_KINDS
 from hypothesis import HealthCheck, Phase, given, settings
 
-KINDS = INPUT_KINDS | COMMAND_KINDS | ARGUMENT_KINDS
+KINDS = INPUT_KINDS | COMMAND_KINDS
 EXAMPLES = {
     "values, identified": 4,
     "excite": 6,
     "loop of a job": 3,
     "result.json": 15,
-    "Python arguments": 40,
 }  # others: 8
 
 

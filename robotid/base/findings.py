@@ -1,8 +1,9 @@
 """Findings about logs, a robot or a result: data, of which sentences are made."""
 
+import difflib
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from string import Formatter
 from typing import Any
@@ -59,6 +60,12 @@ def listed(names: Iterable[object], limit: int | None = None) -> str:
     shown = words[:limit]
     more = f" and {len(words) - len(shown)} more" if len(words) > len(shown) else ""
     return (", ".join(shown) or "none") + more
+
+
+def suggestion(name: str, known: Collection[str]) -> str:
+    """Return ". Did you mean 'x'?" for the most similar known name, or "" if none is similar."""
+    near = difflib.get_close_matches(name, known, n=1)
+    return f". Did you mean {near[0]!r}?" if near else ""
 
 
 def quoted(name: str) -> str:

@@ -7,14 +7,14 @@ from typing import Any
 
 from robotid.base.exceptions import DataError
 from robotid.base.files import check_file
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.cli.console import echo, show_found
 from robotid.cli.job import JOB, SOURCE, add_shown
 from robotid.data.base_motion import ACCELERATION, IMU, POSE, TWIST
 from robotid.data.files.columns import KINDS, is_clock, quantity_of
 from robotid.data.files.read import open_table, write_columns
 from robotid.data.files.table import with_even_stamps
-from robotid.data.log import repeated, suggestion
+from robotid.data.log import repeated
 from robotid.data.signal_settings import LogSource
 from robotid.robot.constraints import Contact
 
@@ -66,9 +66,9 @@ def _standard_names(
     by_joint: dict[str, list[str]] = {}
     quantities = [(name, quantity_of(name, source.effort, joint_of)) for name in names]
     for kind in KINDS:
-        for name, found in quantities:
-            if found and found[0] == kind:
-                joint = joint_of.get(found[1], found[1])
+        for name, quantity in quantities:
+            if quantity and quantity[0] == kind:
+                joint = joint_of.get(quantity[1], quantity[1])
                 pairs.append((f"{kind}_{joint}", name))
                 by_joint.setdefault(joint, []).append(f"{kind}_{joint}")
     if twice := repeated([key for key, _ in pairs]):

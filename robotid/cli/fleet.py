@@ -21,6 +21,7 @@ from robotid.base.files import (
     write_json,
     write_text,
 )
+from robotid.base.findings import suggestion
 from robotid.base.versions import __version__, code_versions
 from robotid.cli.console import echo, progress_of, show_found
 from robotid.cli.identify import identify_job
@@ -35,7 +36,6 @@ from robotid.cli.job import (
     stated_path,
 )
 from robotid.data.files.parquet_files import read_text_table, write_rows
-from robotid.data.log import suggestion
 from robotid.dynamics.factors import available_cores
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.estimation.variation.groups import FEWEST_RUNS
@@ -311,7 +311,7 @@ class _Gathered:
         self._verdicts.update([row["verdict"] for row in rows if row.get("verdict")][:1])
 
     def content(self, units: Sequence[FleetUnit]) -> dict[str, Any]:
-        several = {key: found for key, found in self._values.items() if len(found) >= FEWEST_RUNS}
+        several = {key: rows for key, rows in self._values.items() if len(rows) >= FEWEST_RUNS}
         n_tests = sum(map(len, several.values()))
         parameters, unlike = [], []
         for (robot, name, expression, unit), estimates in several.items():

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from robotid.base.exceptions import DataError
 from robotid.base.findings import listed
-from robotid.base.typing import Array, real_numbers
+from robotid.base.typing import Array, frozen, real_numbers
 
 #: Names of the coordinates of a pose: position [m], and the orientation as a quaternion.
 POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -98,8 +98,7 @@ class BaseMotion:
             )
         pose = self.pose.copy()
         pose[:, 3:] *= continuous_signs(pose[:, 3:]) / sizes[:, None]
-        pose.flags.writeable = False
-        object.__setattr__(self, "pose", pose)
+        object.__setattr__(self, "pose", frozen(pose))
 
     def at(self, rows: slice) -> "BaseMotion":
         """Return some samples."""
@@ -308,10 +307,7 @@ def base_state(
 
 
 def pose_jumps(t: Array, pose: Array) -> tuple[Array, Array, Array]:
-    """Return the jumps of a pose (N, 7) from one row to the next: rows, lengths [m] and angles.
-
-    The difference of a step from its neighbours' mean is compared with those of 32 rows beside it.
-    """
+    """Return the jumps of a pose (N, 7) from one row to the next: rows, lengths [m] and angles."""
     dt, sizes = np.diff(t), np.zeros((2, len(t)))
     if len(dt) < 3:
         return np.empty(0, dtype=int), np.empty(0), np.empty(0)
@@ -360,13 +356,12 @@ def quaternions_of_angles(angles: Array) -> Array:
 
 
 def _checked(values: ArrayLike, name: str, width: int) -> Array:
-    array: Array = real_numbers(values, f"{name} of the base").copy()
+    array = real_numbers(values, f"{name} of the base")
     if array.ndim != 2 or array.shape[1] != width:
         raise DataError(f"{name} of the base has shape {array.shape}, wanted (N, {width})")
     if not np.isfinite(array).all():
         row = int(np.argmin(np.isfinite(array).all(axis=1)))
         raise DataError(f"{name} of the base is not finite in row {row}")
-    array.flags.writeable = False
     return array
 
 
@@ -407,12 +402,7 @@ def bias_at_rest(parts: Sequence[tuple[Array, Array, Array]]) -> tuple[Array, st
 
 
 def orientation_of_imu(t: Array, values: Array, gravity: Array) -> Array:
-    """Return the orientation of a base from an IMU alone, qx qy qz qw, shape (N, 4).
-
-    The angular velocity is integrated; the mean specific force of some seconds, opposite to
-    gravity, corrects the tilt (Mahony, Hamel, Pflimlin 2008, without delay). The heading starts at
-    0. t (N,) [s], values (N, 6), gravity (3,) [m/s^2].
-    """
+    """Return qx qy qz qw (N, 4) of an IMU alone: integrated, levelled (Mahony 2008), heading 0."""
     parts = np.split(np.arange(len(t)), np.flatnonzero(np.diff(t) > _BREAK) + 1)
     return np.concatenate([_levelled(t[k], values[k], -gravity) for k in parts])
 
@@ -465,13 +455,11 @@ def _product(p: Array, q: Array) -> Array:
 def inertial_state(
     t: Array, velocity: Array, down: Array, values: Array, frame: ImuFrame
 ) -> tuple[Array, Array]:
-    """Return twist and its time derivative (N, 6): dv/dt = f - alpha x r - w x (w x r) + g - w x v.
-
-    f is the specific force of an IMU without its offset, r its lever; all with the base's axes.
-    """
+    """Return twist and its time derivative (N, 6) from the specific force f at the lever r."""
     w, f, r = values[:, :3], values[:, 3:], frame.lever
     f = f if frame.offset is None else f - frame.offset
     alpha = np.gradient(w, t, axis=0)
     f = f - np.cross(alpha, r) - np.cross(w, np.cross(w, r))
+    # dv/dt = f - alpha x r - w x (w x r) + g - w x v
     rate = np.hstack([f + down - np.cross(w, velocity), alpha])
     return np.hstack([velocity, w]), rate

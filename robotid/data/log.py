@@ -1,9 +1,8 @@
 """Motion of a robot as arrays: `Log`, the recording, and `Trajectory`, the input of a fit."""
 
-import difflib
 import tempfile
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.settings import is_number, require_each, require_flag, require_kind
 from robotid.base.text import seconds
 from robotid.base.typing import Array, frozen, real_numbers
@@ -332,12 +331,6 @@ def rows_within(
             "inside it"
         )
     return first, stop
-
-
-def suggestion(name: str, known: Collection[str]) -> str:
-    """Return ". Did you mean 'x'?" for the most similar known name, or "" if none is similar."""
-    near = difflib.get_close_matches(name, known, n=1)
-    return f". Did you mean {near[0]!r}?" if near else ""
 
 
 def repeated(names: Sequence[str]) -> list[str]:

@@ -14,7 +14,7 @@ from scipy.linalg.lapack import dtbtrs
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.text import seconds
-from robotid.base.typing import Array
+from robotid.base.typing import Array, frozen
 from robotid.data.base_motion import GAP_STEPS, base_state, pose_jumps
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
@@ -427,11 +427,9 @@ def _resample(t: Array, values: Array, grid: Array) -> Array:
 
 
 def acting_directions(t: Array, w: Array, band: float, longest: float) -> Array:
-    """Return the direction of Coulomb friction at each instant, between -1 and 1, shape (N, c).
+    """Return the direction of Coulomb friction, -1 to 1, (N, c): the sign of the speed w (N, c).
 
-    It is the sign of the speed, in stiction (Karnopp 1985) linear in time from the sign before to
-    the sign after. A drive was in stiction if it was in the band longer than the slopes at the
-    edges of the band indicate, by a factor. t (N,) [s], w (N, c) [rad/s].
+    In stiction, longer in the band than its slopes indicate, it is linear in time (Karnopp 1985).
     """
     directions = np.where(np.abs(w) < _REST, 0.0, np.sign(w))
     for x, direction in zip(w.T, directions.T, strict=True):
@@ -459,11 +457,7 @@ def _crossing(t: Array, x: Array, level: float) -> tuple[float, float]:
 def standing_motion(
     log: Log, max_gap: float, least: Array, fastest: Array, hardest: Array
 ) -> tuple[Trajectory, Array]:
-    """Return the means (K,) of a log over blocks of 0.25 s, and which of them are at rest.
-
-    Blocks in which a joint is too fast, or is accelerated too much, are left out; consecutive ones
-    at rest are one sample. The speed is the slope of the positions over the block.
-    """
+    """Return the means (K,) of a log over slow blocks of 0.25 s, and which of them are at rest."""
     of_block, segment = _blocks(log.t, max_gap)
     first = np.flatnonzero(np.diff(of_block, prepend=-1))
     count = np.diff(np.append(first, len(log.t)))
@@ -530,16 +524,11 @@ def butterworth_poles(order: int, cutoff: float, rate: float) -> Array:
     """Return the ceil(order / 2) poles of a Butterworth low-pass, by the bilinear transform."""
     angles = np.pi * (2 * np.arange((order + 1) // 2) + order + 1) / (2 * order)
     analog = np.tan(np.pi * cutoff / rate) * np.exp(1j * angles)
-    poles = np.asarray((1 + analog) / (1 - analog))
-    poles.flags.writeable = False
-    return poles
+    return frozen((1 + analog) / (1 - analog), np.complex128)
 
 
 def zero_phase(x: Array, order: int, cutoff: float, rate: float, pad: int) -> Array:
-    """Return signals x (N, ...) after a Butterworth filter forwards and backwards.
-
-    Each pass starts from the steady state; both ends are extended by point reflection.
-    """
+    """Return x (N, ...) filtered forwards and backwards, extended by point reflection."""
     if not x.size:
         return x  # LAPACK would write beyond an empty array
     # (k, N): each signal in one piece of memory
@@ -560,10 +549,7 @@ def zero_phase(x: Array, order: int, cutoff: float, rate: float, pad: int) -> Ar
 
 
 def _filter(x: Array, pole: complex, work: Array) -> tuple[Array, Array]:
-    """Return filtered signals (k, N), by one pole or a conjugate pair, and a free array of memory.
-
-    With zeros at half the rate: y + a y' = g (x + x'), or y + a y' + b y'' = g (x + 2 x' + x'').
-    """
+    """Return y (k, N), y + a y' + b y'' = g (x + 2 x' + x''), b = 0 of one pole, and memory."""
     is_real = abs(pole.imag) < 1e-12 * abs(pole)
     a = np.array([1.0, -pole.real] if is_real else [1.0, -2 * pole.real, abs(pole) ** 2])
     for _ in a[1:]:

@@ -6,7 +6,6 @@ from typing import TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robotid.base.exceptions import DataError
 from robotid.base.findings import listed
@@ -208,10 +207,9 @@ def _displacements(log: Log, v: Array) -> tuple[Array, Array]:
     return moved, integral
 
 
-def _is_near(values: Array, wanted: float) -> NDArray[np.bool_]:
+def _is_near(values: Array, wanted: float) -> Array:
     """Return which values are within the tolerance of the wanted one."""
-    near: NDArray[np.bool_] = np.abs(values / wanted - 1) < _NEAR
-    return near
+    return np.asarray(np.abs(values / wanted - 1) < _NEAR)
 
 
 def _once(check: Callable[[Log], ResultT]) -> Callable[[Log], ResultT]:
@@ -239,10 +237,7 @@ def is_timely(log: Log, stated: float = 0.0) -> bool:
 
 @_once
 def velocity_lags(log: Log) -> tuple[float, Array]:
-    """Return the delay of measured velocities after the slopes of positions, and of each joint [s].
-
-    It minimises their distance on a uniform grid, refined by a parabola; 0 if the joints rest.
-    """
+    """Return the delay of measured velocities after the slopes of positions, and by joint [s]."""
     v = _measured(log)
     step = float(np.median(np.diff(log.t)))
     q = np.unwrap(log.q, axis=0)

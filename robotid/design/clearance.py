@@ -18,7 +18,7 @@ from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.design.information import Placements, fixed_tree
 from robotid.dynamics.simulation.motions import Motion
-from robotid.robot.geometry import link_clouds
+from robotid.robot.bodies import link_clouds
 from robotid.robot.model import RobotModel
 
 #: Distance whose violation has the cost of a whole limit of the motion [m]; links that are farther

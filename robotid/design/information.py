@@ -9,8 +9,7 @@ import scipy.linalg
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.typing import Array
 from robotid.dynamics.base_parameters import BaseMapping
-from robotid.dynamics.compiled import Tree, flatten, own_motion, tree_lanes, why_not
-from robotid.dynamics.rows import drive_motion
+from robotid.dynamics.rows import Tree, drive_motion, flatten, own_motion, tree_lanes, why_not
 from robotid.robot.drive_term import DriveMotion, DriveTerm
 from robotid.robot.model import RobotModel
 

@@ -23,18 +23,18 @@ from typing import Any
 import numpy as np
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.settings import SIZE, is_number, require_kind
 from robotid.base.typing import Array
 from robotid.data.files.read import Readable
-from robotid.data.log import Log, suggestion
+from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import low_pass
 from robotid.diagnosis.logs.check_logs import excitation_finding
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.factors import Factors, compress, join, merge
-from robotid.dynamics.prediction import predict, predict_instants
 from robotid.dynamics.prepared_logs import base_problem, independent_share
+from robotid.dynamics.torque import predict, predict_instants
 from robotid.estimation.estimators import Estimate
 from robotid.estimation.estimators.batch import solve_factor
 from robotid.estimation.estimators.determination import base_spread, determine

@@ -1,19 +1,20 @@
-"""The compressed problem: one triangular factor per joint, by sequential QR.
+"""The linear problem W theta = tau as a stream of row blocks, and one triangular factor per joint.
 
-Fits need only the triangular factor R_j of each joint's rows, with R_j^T R_j =
-[W_j tau_j]^T [W_j tau_j]; those of two logs merge. Rows are folded in place by LAPACK's dtpqrt, the
-QR of [R; rows] without the zeros of R, through the address of SciPy's own LAPACK: it copies nothing
-and releases the interpreter's lock. If that is not available, SciPy's wrapper is used.
+W is never in memory as a whole. Fits need only the triangular factor R_j of each joint's rows, with
+R_j^T R_j = [W_j tau_j]^T [W_j tau_j]; those of two logs merge. Rows are folded in place by LAPACK's
+dtpqrt, the QR of [R; rows] without the zeros of R, through the address of SciPy's own LAPACK: it
+copies nothing and releases the interpreter's lock. Without it, SciPy's wrapper is used.
 """
 
 import ctypes
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from itertools import chain, pairwise
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 import scipy.linalg.cython_lapack
@@ -21,7 +22,6 @@ import scipy.linalg.lapack
 
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
-from robotid.dynamics.problem import Problem, RowSource
 
 ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
@@ -29,6 +29,120 @@ ResultT = TypeVar("ResultT")
 _PART = 16384  # samples per part: merging costs little, and there are enough parts for threads
 _PANEL = 8  # columns eliminated at a time: measured fastest for 20 to 70 columns ...
 _WIDE, _WIDE_PANEL = 200, 24  # ... and from so many columns on, which exceed a cache
+_SHUFFLED = 8192  # samples in the buffer of the shuffle: all of a short log, 30 MB of a long one
+
+#: Rows of k samples: W (k n, c), tau (k n,), weight (k n,); row of sample k, joint j: k n + j.
+Block: TypeAlias = tuple[Array, Array, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One sample, for recursive estimators."""
+
+    Y: Array  # regressor, shape (n, c)
+    tau: Array  # measured torque, shape (n,) [N m or N]
+    weight: Array  # row weights, shape (n,); 0 excludes a row
+
+
+class RowSource(ABC):
+    """A problem's rows joint by joint, without columns that are zero or not selected."""
+
+    @property
+    @abstractmethod
+    def samples(self) -> int:
+        """Number N of samples."""
+
+    @property
+    @abstractmethod
+    def is_parallel(self) -> bool:
+        """Whether several threads are faster than one."""
+
+    @property
+    @abstractmethod
+    def columns(self) -> tuple[Array, ...]:
+        """The columns of row j, n arrays of shape (c_j,), ascending."""
+
+    @abstractmethod
+    def rows(self, start: int, stop: int) -> Array:
+        """Return the number of rows with a positive weight per joint, shape (n,), int."""
+
+    @abstractmethod
+    def blocks(self, start: int, stop: int, segment: int | None = None) -> Iterator[list[Array]]:
+        """Yield the rows (k, c_j + 1) of samples start to stop, a few hundred samples at a time."""
+
+    @abstractmethod
+    def select(self, columns: Array) -> "RowSource":
+        """Return the same rows with fewer columns, column k being ``columns[k]`` of this one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """The rows of W theta = tau, which can be read in blocks repeatedly."""
+
+    stream: Callable[[], Iterator[Block]]  # starts a new pass and yields the blocks in order
+    names: tuple[str, ...]  # names of the c columns
+    n_joints: int  # number n of rows per sample
+    support: Array  # shape (n, c), bool: False where row j is zero for every motion
+    sources: tuple[RowSource, ...] = ()  # the same rows joint by joint; empty: only blocks
+    is_projected: bool = False  # whether constraint forces were eliminated, as of ``Factors``
+
+    def blocks(self) -> Iterator[Block]:
+        """Yield the blocks (W (k n, c), tau (k n,), weight (k n,)) from the first one on."""
+        return self.stream()
+
+    def samples(self) -> Iterator[Sample]:
+        """Yield the problem sample by sample, for recursive estimators."""
+        n, c = self.n_joints, len(self.names)
+        for W, tau, weight in self.blocks():
+            yield from map(Sample, W.reshape(-1, n, c), tau.reshape(-1, n), weight.reshape(-1, n))
+
+    def select(self, columns: Array) -> "Problem":
+        """Return the same rows with only the given columns: columns (b,)."""
+
+        def stream() -> Iterator[Block]:
+            for W, tau, weight in self.blocks():
+                yield W[:, columns], tau, weight
+
+        names, sources = tuple(self.names[i] for i in columns), self.sources
+        return replace(
+            self,
+            stream=stream,
+            names=names,
+            support=self.support[:, columns],
+            sources=tuple(source.select(columns) for source in sources),
+        )
+
+
+def concatenate(problems: Sequence[Problem]) -> Problem:
+    """Return one problem with the rows of several in order, for several logs of one robot."""
+    if not problems:
+        raise DataError("there is no problem, wanted that of at least one log")
+    first = problems[0]
+    for other in problems[1:]:
+        if other.names != first.names or other.n_joints != first.n_joints:
+            raise DataError(
+                f"problems differ in their columns: {len(first.names)} of {first.n_joints} "
+                f"joints and {len(other.names)} of {other.n_joints} joints"
+            )
+    has_sources = all(p.sources for p in problems)
+    return replace(
+        first,
+        stream=lambda: chain.from_iterable(problem.blocks() for problem in problems),
+        support=np.any([problem.support for problem in problems], axis=0),
+        sources=tuple(source for p in problems for source in p.sources if has_sources),
+    )
+
+
+def shuffled(samples: Iterable[Sample], rng: np.random.Generator) -> Iterator[Sample]:
+    """Yield samples in random order; those of a long stream are drawn from a buffer of 8192."""
+    buffer: list[Sample] = []
+    for sample in samples:
+        buffer.append(sample)
+        if len(buffer) > _SHUFFLED:
+            k = int(rng.integers(len(buffer)))
+            buffer[k], buffer[-1] = buffer[-1], buffer[k]
+            yield buffer.pop()
+    yield from (buffer[k] for k in rng.permutation(len(buffer)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,10 +254,7 @@ class Reduction:
 
 
 def compress(problem: Problem, *, threads: int | None = None) -> Factors:
-    """Fold a problem into its factors, in parts of a fixed size, whatever the number of threads.
-
-    See Demmel, Grigori, Hoemmen, Langou (2012), Communication-optimal parallel and sequential QR.
-    """
+    """Fold a problem into factors, in parts of one size (Demmel, Grigori, Hoemmen, Langou 2012)."""
     columns = [np.flatnonzero(row) for row in problem.support]
     triangles = [Triangle(len(own) + 1) for own in columns]
     for source in problem.sources:
@@ -220,8 +331,6 @@ def gather(segments: Sequence[Factors], count: int) -> tuple[Factors, ...]:
 
 def join(reductions: Sequence[Reduction]) -> Reduction:
     """Return the reduction of all rows of several reductions."""
-    if not reductions:
-        raise DataError("there is no reduction, wanted that of at least one log")
     return Reduction(
         merge([r.factors for r in reductions]),
         np.sum([r.squares for r in reductions], axis=0),
@@ -277,25 +386,21 @@ class Triangle:
         self._sizes = self._scratch[:4].view(np.intc)
         self._sizes[[4, 6]] = columns, self._panel
 
-    def fold(self, rows: Array) -> None:
-        """Replace R by the factor of [R; rows], rows (m, c) (Golub, Van Loan 2013, 6.5.3)."""
-        self._fold(rows, 0, 0)
-
     def fold_triangle(self, other: Array, places: Array) -> None:
         """Replace R by the triangular factor of [R; other], with places of its columns."""
         if len(places) == len(self.R):
             if self._is_empty:
                 self.R[:], self._is_empty = other, False
             else:
-                self._fold(other.copy(order="F"), 0, len(other))
+                self.fold(other.copy(order="F"), 0, len(other))
             return
         first = int(places[0])
         rows = np.zeros((len(places), len(self.R) - first), order="F")
         rows[:, places - first] = other
-        self._fold(rows, first, len(rows))
+        self.fold(rows, first, len(rows))
 
-    def _fold(self, rows: Array, first: int, triangular: int) -> None:
-        """Fold rows from a column on; the last ones of them are upper trapezoidal."""
+    def fold(self, rows: Array, first: int = 0, triangular: int = 0) -> None:
+        """Replace R by the factor of [R; rows] from a column on (Golub, Van Loan 2013, 6.5.3)."""
         if len(rows) == 0:
             return
         self._is_empty = False

@@ -16,7 +16,7 @@ import numpy as np
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
-from robotid.dynamics.prediction import drive_motion_along
+from robotid.dynamics.torque import drive_motion_along
 from robotid.robot.drive_term import DriveTerm
 from robotid.robot.drives import TERMS, Lag, LuGre, Presliding, Spring
 from robotid.robot.model import RobotModel, pinocchio_model
@@ -149,10 +149,7 @@ def _own_terms(model: RobotModel, d: int) -> list[tuple[int, DriveTerm]]:
 def project_friction(
     model: RobotModel, pi: Array, moments: Mapping[str, DriveMoments], onto: Collection[str]
 ) -> Projection:
-    """Return a robot whose drives have only the terms of a format, by least squares.
-
-    Inertia, and offsets in a format without them, are unchanged; other terms are not negative.
-    """
+    """Return a robot whose drives have only the terms of a format and inertia, by least squares."""
     layout, projected = model.layout, []
     for d, drive in enumerate(layout.drives):
         simple = (*_SIMPLE, Lag.label)  # a delay is not friction: it is omitted and named

@@ -1,22 +1,29 @@
-"""Regressor of joint torques: RobotModel + Trajectory -> Problem.
+"""Torques: their regressor, predictions from parameter vectors, and derivatives.
 
-Pinocchio computes the inertial columns; the drive columns follow them.
+Inertial columns are Pinocchio's; those of the drives follow them. Derivatives are Pinocchio's of
+inverse dynamics: three prismatic joints at position 0 before each joint displace its origin.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from robotid.base.exceptions import DataError
-from robotid.base.typing import Array
+from robotid.base.findings import listed
+from robotid.base.typing import Array, real_numbers
 from robotid.data.log import Trajectory
 from robotid.dynamics.constraint_rows import ProjectedRows, loop_basis, mixed_rows, without_forces
-from robotid.dynamics.problem import Block, Problem, RowSource
+from robotid.dynamics.factors import Block, Problem, RowSource
 from robotid.dynamics.rows import (
     BLOCK,
     BLOCK_SIZE,
+    COMPILED,
+    InertialRows,
+    TrajectoryRows,
     drive_motion,
     drive_values,
     friction_directions,
@@ -24,13 +31,18 @@ from robotid.dynamics.rows import (
     kept_rows,
     remembered,
     trajectory_rows,
+    trajectory_values,
+    work_per_sample,
 )
 from robotid.robot.closure import Chains
 from robotid.robot.drive_term import DriveMotion
-from robotid.robot.drives import TERMS
+from robotid.robot.drives import TERMS, Lag
 from robotid.robot.model import RobotModel
 
+State: TypeAlias = tuple[Array, Array, Array]  # q, v, a
+
 _DECADES = 3.0  # of speeds, at random states of a robot with nonlinear friction
+_START = 5  # constant work of one call of inverse dynamics, as of work_per_sample
 
 
 def joint_torque_regressor(
@@ -43,9 +55,8 @@ def joint_torque_regressor(
 ) -> Array:
     """Return the regressor Y with tau = Y pi at each of N samples, shape (N n_rows, p).
 
-    Ten inertial columns of each body (Atkeson, An, Hollerbach 1986), then those of the drives:
-    ``tau_j = Ia a_j + Fv v_j + Fc sign(v_j) + off``. v and a (N, n_rows); None: directions (N, c)
-    are the signs of the speeds, internal states (N, m) steady ones.
+    Ten columns of each body (Atkeson, An, Hollerbach 1986), then those of the drives. None:
+    directions (N, c) are the signs of the speeds, internal states (N, m) steady ones.
     """
     wanted = (len(q), model.n_rows)
     if v.shape != wanted or a.shape != wanted:
@@ -57,7 +68,7 @@ def joint_torque_regressor(
             raise DataError(f"{name}[{k}] of {row} is {values[k, j]}, wanted a finite number")
     Y = np.zeros((len(q), model.n_rows, len(model.layout.names)))
     inertial_rows(model, q, v, a).write(slice(None), Y)
-    _write_drives(model, q, v, a, direction, memory, Y)
+    _write_drives(model, (q, v, a), direction, memory, Y)
     return Y.reshape(len(q) * model.n_rows, -1)
 
 
@@ -70,7 +81,7 @@ def trajectory_regressor(
         return joint_torque_regressor(model, m.q, m.v, m.a, m.direction, m.memory)
     Y = np.zeros((len(m.t), model.n_rows, len(model.layout.names)))
     stored.write(slice(None) if samples is None else samples, Y)
-    _write_drives(model, m.q, m.v, m.a, m.direction, m.memory, Y)
+    _write_drives(model, (m.q, m.v, m.a), m.direction, m.memory, Y)
     return Y.reshape(len(m.t) * model.n_rows, -1)
 
 
@@ -111,7 +122,7 @@ class InstantRegressor:
             for term, place in self._terms:
                 Y[rows, place] = term.column(motion)
             return Y[:, self._columns]
-        _write_drives(model, q[None], v[None], a[None], None, None, Y[None])
+        _write_drives(model, (q[None], v[None], a[None]), None, None, Y[None])
         return Y[:, self._columns]
 
 
@@ -153,13 +164,9 @@ def build_problem(
 
 
 def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) -> Array:
-    """Return the regressor at random states, shape (N n_rows, p), for structural properties.
-
-    With speeds sqrt(g / length) and accelerations g / length, gravity over inertia is the same for
-    a finger and a crane. Loops are closed, and their forces eliminated.
-    """
+    """Return the regressor at random states, (N n_rows, p); loops closed, without their forces."""
     n = len(model.joints)
-    rate = np.sqrt(9.81 / model.length)  # [1/s]
+    rate = np.sqrt(9.81 / model.length)  # [1/s]: gravity counts the same for finger and crane
     size = np.array([model.length if j.type == "prismatic" else np.pi for j in model.limits])
     q = rng.uniform(-1, 1, (samples, n)) * size
     unit = np.minimum(size, 1.0)  # [rad or m]
@@ -193,19 +200,323 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
 
 
 def _write_drives(
-    model: RobotModel,
-    q: Array,
-    v: Array,
-    a: Array,
-    direction: Array | None,
-    memory: Array | None,
-    Y: Array,
+    model: RobotModel, state: State, direction: Array | None, memory: Array | None, Y: Array
 ) -> None:
     """Write the drives' columns beside those of the bodies, (N, n_rows, p); no memory: steady."""
     layout, size, first = model.layout, model.layout.n_inertial, model.n_rows - len(model.joints)
-    signs = friction_directions(layout, v, direction)
+    signs = friction_directions(layout, state[1], direction)
     if memory is None and layout.remembering:
         load = Y[:, first:, :size] @ model.carried_by[:size]
-        memory = remembered(layout, drive_motion(layout, q, v, a, signs, load))
-    values = drive_values(layout, q, v, a, signs, memory)
+        memory = remembered(layout, drive_motion(layout, *state, signs, load))
+    values = drive_values(layout, *state, signs, memory)
     np.multiply(layout.drive_loads, values.T[:, None], out=Y[:, first:, size:])
+
+
+class TorqueSlopes(NamedTuple):
+    """Derivatives of the torque of the bodies at N samples, of a robot with n joints."""
+
+    by_q: Array  # by the positions, shape (N, n, n)
+    by_v: Array  # by the velocities, likewise
+    by_a: Array  # by the accelerations, likewise: the mass matrix of the bodies
+    by_gravity: Array  # by gravity, along the axes of the world, shape (N, n, 3)
+    by_origin: Array  # by each joint's origin in the body before, (N, n, n, 3): torque, joint, axis
+
+
+def predict(
+    model: RobotModel,
+    parameters: Sequence[Array],
+    trajectory: Trajectory,
+    *,
+    compiled: bool | None = None,
+) -> list[Array]:
+    """Return the torque W theta, (N, n_rows) [N m, N], of each vector; constrained: P W theta."""
+    source = trajectory_rows(model, trajectory, None, compiled)
+    stacked = np.column_stack(list(parameters))
+    few = len(parameters) * (_START + model.pin_model.nv) <= work_per_sample(model)
+    if source.inertial is not None:
+        torques = _from_kept(source, source.inertial, stacked)
+    elif source.engine != COMPILED and few and all(_has_centres(model, pi) for pi in parameters):
+        # Luh, Walker, Paul (1980)
+        torques = [inverse_dynamics(model, pi, trajectory) for pi in parameters]
+    else:
+        torques = _from_rows(source, stacked)
+    if trajectory.basis is None:
+        return torques
+    return [without_forces(trajectory.basis, torque) for torque in torques]
+
+
+def predict_instants(
+    model: RobotModel,
+    pi: Array,
+    q: ArrayLike,
+    v: ArrayLike | None = None,
+    a: ArrayLike | None = None,
+) -> Array:
+    """Return the torques at independent samples, (n_rows,) or (N, n_rows) [N m, N].
+
+    Friction is 0 at rest. Internal states have their steady value under the torque of the bodies,
+    and there is no delay. Of a static robot, v affects only the sign of friction.
+    """
+    q = real_numbers(q, "q")
+    wanted = (*q.shape[:-1], model.n_rows)
+    width = len(model.joints) + 7 * model.free_flyer
+    if q.ndim not in (1, 2) or q.shape[-1] != width:
+        raise DataError(
+            f"q has shape {q.shape}, wanted ({width},) or (N, {width}): "
+            f"{'the pose of the base, then ' if model.free_flyer else ''}a column for each of "
+            f"{listed(model.joints)}"
+        )
+    given = {"q": q}
+    for name, x in (("v", v), ("a", a)):
+        given[name] = np.zeros(wanted) if x is None else real_numbers(x, name)
+        if given[name].shape != wanted:
+            raise DataError(
+                f"{name} has shape {given[name].shape}, wanted {wanted}, as q is {q.shape}: a "
+                f"column for each of {listed(model.row_names)}"
+            )
+    q, v, a = map(np.atleast_2d, given.values())
+    for name, x in zip("qva", (q, v, a), strict=True):
+        if not np.isfinite(x).all():
+            row = int(np.argmin(np.isfinite(x).all(axis=1)))
+            raise DataError(f"{name} is not finite in row {row}: {x[row].tolist()}")
+    direction = friction_directions(model.layout, v, None)
+    if model.is_static:
+        v, a = np.zeros_like(v), np.zeros_like(a)
+    torque = np.empty_like(v)
+    for start in range(0, len(v), BLOCK):
+        k = slice(start, start + BLOCK)
+        Y = joint_torque_regressor(model, q[k], v[k], a[k], direction[k])
+        torque[k] = (Y @ pi).reshape(-1, model.n_rows)
+    return torque.reshape(wanted)
+
+
+def rigid_parts(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> list[Array]:
+    """Return gravity, inertia and velocity torques g, M a, C v of the bodies, (N, n_rows) each."""
+    still = np.zeros_like(v)
+    states = ((still, still), (still, a), (v, a))
+    g, g_and_Ma, total = (_bodies_torque(model, pi, q, *x) for x in states)
+    return [g, g_and_Ma - g, total - g_and_Ma]
+
+
+def _from_rows(source: TrajectoryRows, stacked: Array) -> list[Array]:
+    """Return the rows times the columns of (p, k), k arrays of shape (N, n_rows)."""
+    torques = np.empty((stacked.shape[1], source.samples, len(source.columns)))
+    own = [stacked[columns] for columns in source.columns]
+    start = 0
+    for block in source.blocks(0, source.samples):
+        part = slice(start, start + len(block[0]))
+        for j, rows in enumerate(block):
+            torques[:, part, j] = (rows[:, :-1] @ own[j]).T
+        start = part.stop
+    return list(torques)
+
+
+def _from_kept(source: TrajectoryRows, inertial: InertialRows, stacked: Array) -> list[Array]:
+    """Return the rows times the columns of (p, k), with the inertial columns in memory."""
+    layout, n = source.model.layout, len(source.model.joints)
+    torques, theta = inertial.torque(stacked), stacked[layout.n_inertial :]
+    if theta.any():
+        values = trajectory_values(layout, source.trajectory)  # (drive parameters, N)
+        for torque, own in zip(torques, theta.T, strict=True):
+            torque[:, source.model.n_rows - n :] += values.T @ (layout.drive_loads * own).T
+    return list(torques)
+
+
+def _has_centres(model: RobotModel, pi: Array) -> bool:
+    """Return whether Pinocchio's (m, c, I) keeps the digits; consistent: |m c|^2 <= m tr I / 2."""
+    bodies = pi[: model.layout.n_inertial].reshape(-1, 10)
+    moments = np.sum(bodies[:, 1:4] ** 2, axis=1)
+    return bool((moments <= bodies[:, 0] * bodies[:, [4, 6, 9]].sum(axis=1)).all())
+
+
+def inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
+    """Return the torque W pi by the recursive Newton-Euler algorithm and the drives' terms."""
+    torque = _bodies_torque(model, pi, trajectory.q, trajectory.v, trajectory.a)
+    if pi[model.layout.n_inertial :].any():
+        torque[:, model.n_rows - len(model.joints) :] += drive_torque(model, pi, trajectory)
+    return torque
+
+
+def _bodies_torque(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> Array:
+    """Return the torque of bodies, of inconsistent ones as a difference, shape (N, n_rows)."""
+    return _of_consistent(_newton_euler, model, pi, q, v, a)[0]
+
+
+def drive_torque(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
+    """Return the torque of the drives' terms, shape (N, n) [N m, N]: pi (p,)."""
+    layout, theta = model.layout, pi[model.layout.n_inertial :]
+    return np.asarray(trajectory_values(layout, trajectory).T @ (layout.drive_loads * theta).T)
+
+
+def body_slopes(model: RobotModel, pi: Array, trajectory: Trajectory) -> TorqueSlopes:
+    """Return the derivatives of the bodies' torque by motion, gravity and origins of joints."""
+    state = trajectory.q, trajectory.v, trajectory.a
+    return TorqueSlopes(*_of_consistent(_torque_slopes, model, pi, *state))
+
+
+def body_slopes_by_position(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
+    """Return ``body_slopes`` by the positions alone, (N, n, n), several times as fast."""
+    return _of_consistent(_position_slopes, model, pi, trajectory.q, trajectory.v, trajectory.a)[0]
+
+
+def _of_consistent(
+    linear: Callable[..., Sequence[Array]], model: RobotModel, pi: Array, *state: Array
+) -> Sequence[Array]:
+    """Return values that are linear in the bodies, or their difference for two consistent sets."""
+    added = _consistent_addition(model, pi)
+    total = linear(model, pi + added, *state)
+    if not added.any():
+        return total
+    return [x - y for x, y in zip(total, linear(model, added, *state), strict=True)]
+
+
+def _consistent_addition(model: RobotModel, pi: Array) -> Array:
+    """Return bodies whose sum with those of pi is physically consistent, shape (p,)."""
+    added = np.zeros_like(pi)
+    if _has_centres(model, pi):
+        return added
+    bodies, more = (x[: model.layout.n_inertial].reshape(-1, 10) for x in (pi, added))
+    moment = np.linalg.norm(bodies[:, 1:4], axis=1)
+    more[:, 0] = np.abs(bodies[:, 0]) + moment / model.length
+    size = np.abs(bodies[:, 4:]).max(axis=1) + moment * model.length
+    more[:, [4, 6, 9]] = size[:, None]
+    return added
+
+
+def _newton_euler(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> tuple[Array]:
+    """Return the torque of consistent bodies, shape (N, n_rows)."""
+    G, pin_model = model.velocity_map, model.with_parameters(pi).pin_model
+    data, torque = pin_model.createData(), np.empty((len(v), pin_model.nv))
+    is_plain = np.array_equal(G, np.eye(len(G)))
+    configurations = np.ascontiguousarray(model.configurations(q))
+    if v.any() or a.any():
+        rates, changes = (v, a) if is_plain else (v @ G.T, a @ G.T)
+        instants = zip(torque, configurations, rates, changes, strict=True)
+        for torque_k, q_k, v_k, a_k in instants:
+            torque_k[:] = pin.rnea(pin_model, data, q_k, v_k, a_k)
+    else:
+        for torque_k, q_k in zip(torque, configurations, strict=True):
+            torque_k[:] = pin.computeGeneralizedGravity(pin_model, data, q_k)
+    return (torque if is_plain else torque @ G,)  # tau = G^T tau_pinocchio
+
+
+def _position_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> tuple[Array]:
+    """Return the derivatives of the bodies' torque by the positions, shape (N, n, n)."""
+    own, G = model.with_parameters(pi).pin_model, model.velocity_map
+    slopes, data = np.empty((len(q), own.nv, own.nv)), own.createData()
+    states = zip(model.configurations(q), v @ G.T, a @ G.T, strict=True)
+    for D, state in zip(slopes, states, strict=True):
+        D[:] = pin.computeRNEADerivatives(own, data, *state)[0]
+    return (G.T @ slopes @ G,)
+
+
+def _torque_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> tuple[Array, ...]:
+    """Return the arrays of ``TorqueSlopes`` (Carpentier, Mansard 2018, Analytical Derivatives)."""
+    plain, G = model.with_parameters(pi).pin_model, model.velocity_map
+    extended, joints = _with_movable_origins(plain)
+    own = np.array([extended.joints[k].idx_v for k in joints])  # rows of the robot's own joints
+    before = np.array([extended.joints[k - 1].idx_v for k in joints])  # and of their origins
+    first_q = [(extended.joints[k].idx_q, plain.joints[i].idx_q, plain.joints[i].nq)
+               for i, k in enumerate(joints, start=1)]  # fmt: skip
+    configurations = np.zeros((len(q), extended.nq))
+    known = model.configurations(q)
+    for to, here, size in first_q:
+        configurations[:, to : to + size] = known[:, here : here + size]
+    velocities, accelerations = np.zeros((2, len(v), extended.nv))
+    velocities[:, own], accelerations[:, own] = v @ G.T, a @ G.T
+    slopes = np.empty((3, len(q), len(own), extended.nv))
+    derive, data = pin.computeRNEADerivatives, extended.createData()
+    states = zip(configurations, velocities, accelerations, strict=True)
+    for D_q, D_v, D_a, state in zip(*slopes, states, strict=True):
+        by_q, by_v, by_a = derive(extended, data, *state)
+        by_q.take(own, 0, D_q, "clip")  # without bound checks
+        by_v.take(own, 0, D_v, "clip")
+        by_a.take(own, 0, D_a, "clip")
+    D: Array = G.T @ slopes  # tau = G^T tau_pinocchio
+    by_q, by_v, by_a = D[..., own] @ G
+    leaders = np.array([plain.getJointId(name) - 1 for name in model.joints])
+    axes = before[leaders][:, None] + np.arange(3)
+    roots = before[[plain.parents[i] == 0 for i in range(1, plain.njoints)]]
+    falling = sum(D[2][..., root : root + 3] for root in roots)  # as the base is accelerated
+    return by_q, by_v, by_a, -falling, D[0][..., axes]
+
+
+def _with_movable_origins(model: pin.Model) -> tuple[pin.Model, list[int]]:
+    """Return a robot with a 3-axis prismatic joint before each joint, and its own joints in it."""
+    extended, joints = pin.Model(), [0]
+    extended.gravity = model.gravity
+    for i in range(1, model.njoints):
+        place, name = model.jointPlacements[i], model.names[i]
+        there = pin.SE3(np.eye(3), place.translation)
+        origin = extended.addJoint(
+            joints[model.parents[i]], pin.JointModelTranslation(), there, f"{name} origin"
+        )
+        rotated = pin.SE3(place.rotation, np.zeros(3))
+        joints.append(extended.addJoint(origin, model.joints[i], rotated, name))
+        extended.appendBodyToJoint(joints[-1], model.inertias[i], pin.SE3.Identity())
+    return extended, joints[1:]
+
+
+def is_loaded(model: RobotModel) -> bool:
+    """Return whether columns depend on the torque of a robot's reference; bristles' do not."""
+    return any(term.needs_load for _, term in model.layout.drive_parameters)
+
+
+def remember(model: RobotModel, trajectory: Trajectory) -> Trajectory:
+    """Return a trajectory with the columns of drive terms with internal state or load."""
+    if not model.layout.remembering:
+        return trajectory
+    is_lagging = any(isinstance(term, Lag) for _, term in model.layout.drive_parameters)
+    motion = drive_motion_along(model, trajectory, has_rate=is_lagging)
+    return trajectory.with_states(remembered(model.layout, motion))
+
+
+def drive_motion_along(
+    model: RobotModel, trajectory: Trajectory, *, has_rate: bool = True
+) -> DriveMotion:
+    """Return motion, load (of bodies) and rate (of all torques) of the drives, (d, N), cached."""
+    key, known = (model.pin_model, model.layout, has_rate), trajectory.derived.get("drive motion")
+    if known is None or known[0] != key or not np.array_equal(known[1], model.carried_by):
+        moved = _drive_motion(model, trajectory, has_rate)
+        trajectory.derived["drive motion"] = known = key, model.carried_by, moved
+    motion: DriveMotion = known[2]
+    return motion
+
+
+def _load_torque(model: RobotModel, trajectory: Trajectory) -> Array:
+    """Return the bodies' torque by the model's reference, once, (N, n_rows) [N m, N]."""
+    pi = model.carried_by[: model.layout.n_inertial]
+    known = trajectory.derived.get("load torque")
+    if known is None or known[0] is not model.pin_model or not np.array_equal(known[1], pi):
+        plain = model.with_terms({})
+        bodies = np.zeros(len(plain.layout.names))
+        bodies[: len(pi)] = pi
+        (load,) = predict(plain, [bodies], trajectory)
+        trajectory.derived["load torque"] = known = model.pin_model, pi, load
+    return known[2]
+
+
+def _drive_motion(model: RobotModel, trajectory: Trajectory, has_rate: bool) -> DriveMotion:
+    """Return the motion and load of drives as of ``drive_motion_along``."""
+    layout, m = model.layout, trajectory.with_states(None)  # that of another reference, if any
+    first = model.n_rows - len(model.joints)
+    signs = friction_directions(layout, m.v, m.direction)
+    begins = np.diff(m.segment, prepend=m.segment[:1] - 1) != 0
+    load = _load_torque(model, m)[:, first:]
+    motion = drive_motion(layout, m.q, m.v, m.a, signs, load, None, begins)
+    if not has_rate:
+        return motion
+    if layout.remembering:
+        m = m.with_states(remembered(layout, motion))
+    rate = _rate(load + drive_torque(model, model.carried_by, m), m)
+    return drive_motion(layout, m.q, m.v, m.a, signs, load, rate, begins)
+
+
+def _rate(torque: Array, motion: Trajectory) -> Array:
+    """Return the change of torques within each segment, shape (N, n) [N m/s, N/s]."""
+    rate = np.zeros_like(torque)
+    edges = np.flatnonzero(np.diff(motion.segment)) + 1
+    for part in np.split(np.arange(len(motion.t)), edges):
+        if len(part) > 1:
+            rate[part] = np.gradient(torque[part], motion.t[part], axis=0)
+    return rate

@@ -18,7 +18,7 @@ from robotid.base.settings import NOT_NEGATIVE, POSITIVE, Settings, is_number, r
 from robotid.base.typing import Array, real_numbers
 from robotid.data.log import Log, Trajectory
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.problem import Sample
+from robotid.dynamics.factors import Sample
 from robotid.dynamics.rows import sure_rows
 from robotid.dynamics.torque import InstantRegressor
 from robotid.estimation.estimators import Estimate, Kalman, KalmanState

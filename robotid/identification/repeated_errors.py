@@ -36,8 +36,8 @@ from robotid.data.log import Trajectory
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.constraint_rows import constraint_forces, contact_links, without_forces
 from robotid.dynamics.factors import Triangle, join, triangle_of
-from robotid.dynamics.prediction import predict
 from robotid.dynamics.prepared_logs import base_problem
+from robotid.dynamics.torque import predict
 from robotid.estimation.estimators import WLS
 from robotid.estimation.fitting.recorded import Recordings, RepeatedErrors, Rows
 from robotid.robot.constraints import Contact

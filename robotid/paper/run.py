@@ -24,13 +24,13 @@ from robotid.output.pages.html import (
 )
 from robotid.output.viewer.replays import Torques, replay
 from robotid.paper.planar_2r import urdf_text
-from robotid.paper.procedure import LoopSettings
 from robotid.paper.study import (
     AMPLITUDE,
     CASES,
     DURATION,
     MODELS,
     PROGRAM,
+    LoopSettings,
     ModelStudy,
     PaperSettings,
     RandomRuns,

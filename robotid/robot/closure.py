@@ -51,10 +51,7 @@ class Chains:
         return np.sqrt(np.add.reduceat(errors**2, first, axis=1))
 
     def closed(self, q: Array, unknown: Array) -> Array:
-        """Return positions q (N, n) with the unknown ones, (n,) bool, such that the loops close.
-
-        The coordinates are constant from the first sample at which they do not; see ``gaps``.
-        """
+        """Return closed positions q (N, n) with the unknown ones (n,), constant once open."""
         x, closed = self._assembled(), q.copy()  # how the chains are assembled
         singular = np.linalg.svd(self._equations(x)[1][:, unknown], compute_uv=False)
         if np.sum(singular > _DEAD * self._model.length) < unknown.sum():
@@ -79,10 +76,7 @@ class Chains:
         return bool(self.gaps(x[None]).max() <= _CLOSED * self._model.length)
 
     def random_states(self, samples: int, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Return closed coordinates (N, n) and orthogonal projectors Z (N, n, n): speeds Z v.
-
-        The random walk does not cross dead centres: chains stay assembled as in the zero position.
-        """
+        """Return random closed coordinates (N, n) of this assembly, projectors Z (N, n, n) on v."""
         n = len(self._model.joints)
         every, size = np.ones(n, dtype=bool), np.where(self._is_long, self._model.length, 1.0)
         q, Z = np.empty((samples, n)), np.empty((samples, n, n))

@@ -1,6 +1,5 @@
 """Constraints between frames: contacts with the ground, and joints that close kinematic chains."""
 
-import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from functools import cached_property
@@ -10,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from robotid.base.exceptions import ModelError, SettingsError
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.settings import Range, Settings, require_each, require_flag, require_kind, setting
 from robotid.base.typing import Array
 from robotid.robot.drive_term import DriveTerm
@@ -213,11 +212,9 @@ def check_constraints(
     for constraint in constraints:
         for frame in constraint.frames:
             if frame not in links:
-                near = difflib.get_close_matches(frame, links, n=1)
-                hint = f". Did you mean {near[0]!r}?" if near else ""
                 raise ModelError(
                     f"contact or loop at {frame!r}, which is not a link of {file}; links: "
-                    f"{listed(links)}{hint}"
+                    f"{listed(links)}{suggestion(frame, links)}"
                 )
     stated = [constraint.frames for constraint in constraints]
     if twice := [x for k, x in enumerate(stated) if x in stated[:k]]:

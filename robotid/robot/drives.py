@@ -326,7 +326,6 @@ class Spring(MemorylessTerm):
     position_law = staticmethod(linear)
     units = ("N m/rad", "N/m")
     is_shared = False
-    is_friction = True
     guards = "q"
     part = "spring"
 
@@ -391,7 +390,6 @@ class Lag(DriveTerm):
     has_state = True
     needs_load = True
     is_measured = True
-    is_friction = True
     typical = (0.005, 0.02)
     part = "delay"
 

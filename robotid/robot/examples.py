@@ -24,9 +24,7 @@ def example_urdfs() -> tuple[Path, ...]:
 
 def example_urdf(name: str) -> Path:
     """Return the path of one example robot."""
-    urdfs = example_urdfs()
-    for path in urdfs:
-        if path.name == name:
-            return path
-    names = [path.name for path in urdfs]
-    raise ModelError(f"example-robot-data has no {name!r}; it has {listed(names)}")
+    by_name = {path.name: path for path in reversed(example_urdfs())}
+    if name not in by_name:
+        raise ModelError(f"example-robot-data has no {name!r}; it has {listed(sorted(by_name))}")
+    return by_name[name]

@@ -14,7 +14,7 @@ import pinocchio as pin
 from robotid.base.exceptions import DataError, ModelError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.settings import LARGEST_SETTING, require_each, require_flag, require_kind
-from robotid.base.typing import Array, real_numbers
+from robotid.base.typing import Array, frozen, real_numbers
 from robotid.robot.constraints import Constraint, Contact, Loop, check_constraints
 from robotid.robot.drive_term import DriveMotion, DriveTerm
 from robotid.robot.drives import DRIVE_TERMS, TERMS
@@ -388,9 +388,7 @@ class RobotModel:
         inertial = np.repeat((self.velocity_map.T != 0) @ moves[:, 1:], 10, axis=1)
         drive = np.zeros((self.n_rows, len(self.layout.drive_names)), dtype=bool)
         drive[self.n_rows - len(self.joints) :] = self.layout.drive_loads != 0.0
-        support = np.hstack([inertial, drive])
-        support.flags.writeable = False
-        return support
+        return frozen(np.hstack([inertial, drive]), np.bool_)
 
 
 def pinocchio_model(model: RobotModel, pi: Array) -> pin.Model:

@@ -146,11 +146,8 @@ class ParameterLayout:
 
     @cached_property
     def drive_speeds(self) -> Array:
-        """Speed of each of the d drives that is equivalent to 1 rad/s, (d,) [rad/s or m/s].
-
-        A prismatic joint crosses its stroke (or 1 m) in the time of a revolution; a coupling has
-        the mean of its joints, weighted by their ratios.
-        """
+        """Speed of each of the d drives that is equivalent to 1 rad/s, (d,) [rad/s or m/s]."""
+        # a prismatic joint crosses its stroke, or 1 m, in the time of a revolution
         joints = [
             self.strokes.get(joint, 1.0) / (2 * np.pi) if joint in self.prismatic else 1.0
             for joint in self.joints
@@ -257,16 +254,11 @@ def pseudo_inertia_basis() -> Array:
         basis[k, axis, axis] = -0.5
     for k, (i, j) in ((5, (0, 1)), (7, (0, 2)), (8, (1, 2))):
         basis[k, i, j] = basis[k, j, i] = -1.0
-    basis.flags.writeable = False
-    return basis
+    return frozen(basis)
 
 
 def pseudo_inertia(pi: Array) -> Array:
-    """Return J = [[Sigma, m c], [(m c)^T, m]] of each of n bodies, (n, 4, 4).
-
-    A body is physically consistent if and only if J is positive semidefinite: Wensing, Kim, Slotine
-    (2018), Linear Matrix Inequalities for Physically Consistent Inertial Parameter Identification.
-    """
+    """Return J = [[Sigma, m c], [(m c)^T, m]] of n bodies, (n, 4, 4): Wensing 2018, (8)."""
     return np.asarray(np.einsum("nk,kij->nij", _by_body(pi), pseudo_inertia_basis()))
 
 

@@ -8,9 +8,15 @@ from types import MappingProxyType
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.robot.bodies import held_parameters, link_places, negligible_bodies
+from robotid.robot.bodies import (
+    BEYOND_FRAMES,
+    body_frames,
+    body_points,
+    held_parameters,
+    link_places,
+    negligible_bodies,
+)
 from robotid.robot.drive_term import DriveMotion
-from robotid.robot.geometry import BEYOND_FRAMES, body_frames, body_points
 from robotid.robot.mass_matrix import carried_inertia
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia

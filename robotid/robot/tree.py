@@ -1,7 +1,6 @@
 """The only parser of URDFs: each fault raises an error; Pinocchio receives the tree alone."""
 
 import copy
-import difflib
 import logging
 import math
 import re
@@ -19,7 +18,7 @@ import numpy as np
 
 from robotid.base.exceptions import ModelError
 from robotid.base.files import DEEPEST, LONGEST_PATH, missing_file
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 
 #: Largest absolute value of numbers, SI units: squares and products of them stay finite.
 LARGEST = 1e9
@@ -354,10 +353,9 @@ def _check_joints(tree: Tree, names: Sequence[str], followers: Mapping[str, obje
                 raise ModelError(
                     f"joint {name!r} is fixed in {Path(tree.path).name}: it cannot move"
                 )
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f" Did you mean {near[0]!r}?" if near else ""
             raise ModelError(
-                f"joint {name!r} is not in {Path(tree.path).name}; joints: {listed(known)}.{hint}"
+                f"joint {name!r} is not in {Path(tree.path).name}; joints: {listed(known)}"
+                f"{suggestion(name, known)}"
             )
 
 
@@ -488,11 +486,7 @@ def read_numbers(
 
 
 def exact_angle(word: str) -> float | None:
-    """Return the multiple of pi/12 that an angle approximates, None if it is not a rounded one.
-
-    The multiple, rounded or truncated to the angle's decimals (two for pi/2, else four), is equal
-    to it, as 3.1415; or they are within 2e-5 rad. A calibrated angle, as 1.570912, is none.
-    """
+    """Return the multiple of pi/12 of a rounded angle, as 3.1415; None of another, as 1.570912."""
     values = numbers(word, 1)
     twelfths = round(values[0] / (math.pi / 12)) if values else 0
     if twelfths == 0:

@@ -27,14 +27,10 @@ PHASE = T[:, None] * [2.0, 3.0]
 
 def make_log(**changes):
     fields = {
-        "t": T,
-        "q": np.sin(PHASE),
-        "v": np.cos(PHASE) * [2.0, 3.0],
-        "a": -np.sin(PHASE) * [4.0, 9.0],
-        "tau": 10 * np.cos(PHASE),
-        "joints": JOINTS,
+        "t": T, "q": np.sin(PHASE), "v": np.cos(PHASE) * [2.0, 3.0],
+        "a": -np.sin(PHASE) * [4.0, 9.0], "tau": 10 * np.cos(PHASE), "joints": JOINTS,
         "path": "somewhere/run3.csv",
-    }
+    }  # fmt: skip
     return Log(**(fields | changes))
 
 

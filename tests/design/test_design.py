@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+
 from robotid.base.exceptions import SettingsError
 from robotid.data.files.read import open_table
 from robotid.data.signal_settings import LogSource

@@ -5,7 +5,7 @@ import pytest
 from helpers.robots import JOINT, LINK, ROBOTS, mimicking, motion
 
 from robotid.base.exceptions import DataError
-from robotid.dynamics import compiled, factors, rows
+from robotid.dynamics import factors, rows
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import compress
 from robotid.dynamics.rows import COMPILED, TrajectoryRows, friction_speeds
@@ -49,7 +49,7 @@ def assert_is_pinocchio(model, trajectory):
 def test_compiled_rows_are_pinocchios(case, rng):
     name, options = ROBOTS[case]
     model = RobotModel.from_urdf(example_urdf(name), **options)
-    assert compiled.why_not(model) is None
+    assert rows.why_not(model) is None
     assert_is_pinocchio(model, motion(model, rng, 150))  # two groups of lanes and a part
     direction = rng.uniform(-1.2, 1.2, (150, len(friction_speeds(model.layout))))
     assert_is_pinocchio(model, motion(model, rng, 150, direction=direction))
@@ -114,6 +114,6 @@ def test_the_path_is_chosen_by_the_length_of_the_log_and_said(ur5, rng, monkeypa
         short = build_problem(ur5, trajectory).sources[0]
     assert short.engine.startswith("Pinocchio (the compiled path is slower below 120690 samples")
     assert f"ur5: regressor of 200 samples: {short.engine}" in caplog.text
-    monkeypatch.setattr(rows, "LONG_ENOUGH", 200 * compiled.work_per_sample(ur5))
+    monkeypatch.setattr(rows, "LONG_ENOUGH", 200 * rows.work_per_sample(ur5))
     assert build_problem(ur5, trajectory).sources[0].engine == COMPILED
     assert build_problem(ur5, trajectory, compiled=False).sources[0].engine == "Pinocchio"

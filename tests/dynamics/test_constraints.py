@@ -20,8 +20,7 @@ from robotid.dynamics.constraint_rows import (
     without_forces,
 )
 from robotid.dynamics.factors import compress, compress_segments, merge
-from robotid.dynamics.prediction import predict
-from robotid.dynamics.torque import build_problem, joint_torque_regressor
+from robotid.dynamics.torque import build_problem, joint_torque_regressor, predict
 from robotid.robot.constraints import Contact, Loop
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -51,11 +50,15 @@ def random_motion(model, rng, samples):
     return q, *rng.standard_normal((2, samples, 6 + n))
 
 
+def trajectory(model, q, v, a, **more):
+    values = {"tau": 0 * v, "rate": None, "segment": np.zeros(len(q), dtype=int)} | more
+    return Trajectory(t=np.arange(float(len(q))), q=q, v=v, a=a, joints=model.joints, **values)
+
+
 def moved(model, q, speed, step):
     """Return coordinates after a step at a speed."""
-    x = pin.integrate(
-        model.pin_model, model.configurations(q[None])[0], model.velocity_map @ speed * step
-    )
+    start = model.configurations(q[None])[0]
+    x = pin.integrate(model.pin_model, start, model.velocity_map @ speed * step)
     data = model.pin_model.createData()
     pin.framesForwardKinematics(model.pin_model, data, x)
     return data
@@ -80,9 +83,8 @@ def test_the_jacobian_is_the_velocity_of_the_feet(quadruped, rng):
 def test_the_force_on_a_round_foot_acts_below_its_frame(rng):
     """The velocity at the contact is that of the point of the foot which touches the ground."""
     contact = Contact(FEET[2], radius=0.03)
-    model = RobotModel.from_urdf(
-        example_urdf("solo12.urdf"), free_flyer=True, constraints=[contact], terms=()
-    )
+    options = {"free_flyer": True, "constraints": [contact], "terms": ()}
+    model = RobotModel.from_urdf(example_urdf("solo12.urdf"), **options)
     q, v, _ = random_motion(model, rng, 1)
     (J,) = constraint_jacobian(model, q, np.ones((1, 1), dtype=bool))
     frame = model.pin_model.getFrameId(FEET[2], pin.FrameType.BODY)
@@ -94,12 +96,9 @@ def test_the_force_on_a_round_foot_acts_below_its_frame(rng):
 def test_a_wrench_with_the_axes_of_its_link(quadruped, rng):
     q, _, _ = random_motion(quadruped, rng, 2)
     flags = np.ones((2, 4), dtype=bool)
-    world, own = (
-        constraint_jacobian(replace(quadruped, constraints=contacts), q, flags)
-        for contacts in (
-            [replace(x, axes=axes) for x in quadruped.constraints] for axes in ("world", "link")
-        )
-    )
+    contacts = ([replace(x, axes=y) for x in quadruped.constraints] for y in ("world", "link"))
+    robots = (replace(quadruped, constraints=x) for x in contacts)
+    world, own = (constraint_jacobian(robot, q, flags) for robot in robots)
     for k in range(2):
         data = moved(quadruped, q[k], np.zeros(18), 0.0)
         for i, foot in enumerate(FEET):
@@ -107,12 +106,6 @@ def test_a_wrench_with_the_axes_of_its_link(quadruped, rng):
             rows = slice(3 * i, 3 * i + 3)
             np.testing.assert_allclose(own[k, rows], R.T @ world[k, rows], atol=1e-12)
         np.testing.assert_allclose(own[k, 12:], R.T @ world[k, 12:], atol=1e-12)
-    with pytest.raises(
-        SettingsError, match="contact 'a': axes is 'foot', wanted one of world, link"
-    ):
-        Contact("a", axes="foot")
-    with pytest.raises(SettingsError, match=r"contact 'a': threshold is 'x', wanted a force \[N\]"):
-        Contact("a", threshold="x")
 
 
 def test_unknown_forces_have_no_effect_and_measured_ones_are_subtracted(
@@ -127,11 +120,8 @@ def test_unknown_forces_have_no_effect_and_measured_ones_are_subtracted(
     J, f = constraint_jacobian(quadruped, q, touching), rng.standard_normal((7, 15))
     tau = rigid - np.einsum("kmj,km->kj", J, f)
     measured = [11, 12]  # fz and mx of the last foot
-    motion = Trajectory(
-        t=np.arange(7.0), q=q, v=v, a=a, tau=tau, joints=quadruped.joints, rate=None,
-        segment=np.zeros(7, dtype=int), contacts=flags, wrenches=f[:, measured],
-        switching=np.arange(7) == 4,
-    )  # fmt: skip
+    known = {"contacts": flags, "wrenches": f[:, measured], "switching": np.arange(7) == 4}
+    motion = trajectory(quadruped, q, v, a, tau=tau, **known)
     found, used = constrained(quadruped, motion, np.ones((7, 18), dtype=bool))
     (predicted,) = predict(quadruped, [pi], found)
     with pytest.raises(DataError, match="has contact flags of 4 contacts, wanted 3, one for each"):
@@ -158,10 +148,8 @@ def test_forces_are_those_of_least_squares_over_the_rows_used(quadruped, rng):
     q, v, a = random_motion(quadruped, rng, 3)
     flags = np.array([[1, 0, 1], [1, 1, 0], [0, 0, 1]], dtype=bool)
     torque, tau, projected = rng.normal(size=(3, 3, 18))
-    motion = Trajectory(
-        t=np.arange(3.0), q=q, v=v, a=a, tau=tau, joints=quadruped.joints, rate=None,
-        segment=np.zeros(3, dtype=int), contacts=flags, wrenches=rng.normal(size=(3, 2)),
-    )  # fmt: skip
+    wrenches = rng.normal(size=(3, 2))
+    motion = trajectory(quadruped, q, v, a, tau=tau, contacts=flags, wrenches=wrenches)
     used = rng.random((3, 18)) < 0.8
     J = constraint_jacobian(quadruped, q, np.column_stack([flags, np.ones(3, dtype=bool)]))
     for own in (motion, replace(motion, basis=np.zeros((3, 18, 1)), tau=projected, loaded=tau)):
@@ -187,11 +175,8 @@ def test_links_of_contacts_have_their_axes_and_turn_in_the_world(quadruped, rng)
 
 def test_without_torque_only_rows_of_the_base_are_used(quadruped, rng):
     q, v, a = random_motion(quadruped, rng, 2)
-    motion = Trajectory(
-        t=np.arange(2.0), q=q, v=v, a=a, tau=0 * v, joints=quadruped.joints, rate=None,
-        segment=np.zeros(2, dtype=int), contacts=np.zeros((2, 3), dtype=bool),
-        wrenches=np.zeros((2, 2)),
-    )  # fmt: skip
+    air = {"contacts": np.zeros((2, 3), dtype=bool), "wrenches": np.zeros((2, 2))}
+    motion = trajectory(quadruped, q, v, a, **air)
     found, used = constrained(quadruped, motion, np.ones((2, 18), dtype=bool), has_torque=False)
     assert used.tolist() == [[True] * 6 + [False] * 12] * 2
     assert not found.basis[:, 6:].any()  # a force on the base may not act through a joint
@@ -203,11 +188,9 @@ def test_rows_are_projected_and_counted(quadruped, rng):
     q, v, a = random_motion(quadruped, rng, 40)
     weight = rng.uniform(0.5, 2.0, (40, 18)) * (rng.random((40, 18)) < 0.9)
     weight[:, 9] = 0.0  # its torque is projected into other rows
-    motion = Trajectory(
-        t=np.arange(40.0), q=q, v=v, a=a, tau=rng.standard_normal((40, 18)),
-        joints=quadruped.joints, rate=None, segment=np.zeros(40, dtype=int),
-        contacts=rng.random((40, 3)) < 0.5, switching=np.zeros(40, dtype=bool),
-        wrenches=rng.standard_normal((40, 2)),
+    motion = trajectory(
+        quadruped, q, v, a, tau=rng.standard_normal((40, 18)), contacts=rng.random((40, 3)) < 0.5,
+        switching=np.zeros(40, dtype=bool), wrenches=rng.standard_normal((40, 2)),
     )  # fmt: skip
     found, used = constrained(quadruped, motion, np.ones((40, 18), dtype=bool))
     problem = build_problem(quadruped, found, used * weight)
@@ -293,10 +276,9 @@ def test_contacts_state_what_logs_have(quadruped):
         (lambda: Contact("a", "line"), "contact 'a': kind is 'line', wanted one of point, surface"),
         (lambda: Contact("a", measured=("mx",)), "measured of the point contact 'a' has 'mx'"),
         (lambda: Contact("a", measured=("fx", "fx")), "some of fx, fy, fz, each once"),
-        (
-            lambda: Contact("a", radius=-0.1),
-            "contact 'a': radius is -0.1, wanted a length [m], at least 0",
-        ),
+        (lambda: Contact("a", radius=-0.1), "radius is -0.1, wanted a length [m], at least 0"),
+        (lambda: Contact("a", axes="foot"), "'a': axes is 'foot', wanted one of world, link"),
+        (lambda: Contact("a", threshold="x"), "contact 'a': threshold is 'x', wanted a force [N]"),
         (lambda: Contact("a", "surface", radius=0.1), "radius of the surface contact 'a' is 0.1"),
         (lambda: Contact("a", radius="2 cm"), "contact 'a': radius is '2 cm', wanted a length [m]"),
         (lambda: Loop(("a", "a")), "loop has the frames a, a, wanted two links"),
@@ -311,9 +293,8 @@ def test_wrong_constraints_are_refused(contact, message):
 
 def test_a_contact_of_an_unknown_link_is_refused():
     urdf = example_urdf("solo12.urdf")
-    with pytest.raises(
-        ModelError, match=r"'FL_FOTO', which is not a link of solo12.urdf.*'FL_FOOT'"
-    ):
+    words = r"'FL_FOTO', which is not a link of solo12.urdf.*'FL_FOOT'"
+    with pytest.raises(ModelError, match=words):
         RobotModel.from_urdf(urdf, free_flyer=True, constraints=[Contact("FL_FOTO")])
     with pytest.raises(ModelError, match="the contact or loop at FL_FOOT is stated twice"):
         RobotModel.from_urdf(urdf, constraints=[Contact("FL_FOOT"), Contact("FL_FOOT", "surface")])

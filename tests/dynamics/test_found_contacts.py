@@ -12,8 +12,8 @@ from robotid.data.base_motion import BaseMotion, quaternions_of_angles
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.constraint_rows import constraint_jacobian
-from robotid.dynamics.prediction import predict_instants
 from robotid.dynamics.prepared_logs import find_contacts, with_contacts
+from robotid.dynamics.torque import predict_instants
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

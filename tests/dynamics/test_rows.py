@@ -7,7 +7,6 @@ import pytest
 from helpers.robots import ROBOTS, motion, possible_parameters
 
 from robotid.dynamics import rows
-from robotid.dynamics.prediction import predict, remember
 from robotid.dynamics.rows import (
     drive_motion,
     friction_speeds,
@@ -15,7 +14,7 @@ from robotid.dynamics.rows import (
     kept_rows,
     sure_rows,
 )
-from robotid.dynamics.torque import build_problem, trajectory_regressor
+from robotid.dynamics.torque import build_problem, predict, remember, trajectory_regressor
 from robotid.robot.drives import LoadFriction
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

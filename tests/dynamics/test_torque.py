@@ -6,7 +6,7 @@ from robotid.base.exceptions import DataError
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import Transmission
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.problem import Sample, shuffled
+from robotid.dynamics.factors import Sample, shuffled
 from robotid.dynamics.torque import (
     InstantRegressor,
     build_problem,
@@ -31,29 +31,24 @@ def states(model, rng, samples=5):
     return q, v, a
 
 
-@pytest.mark.parametrize("name", ROBOTS)
-@pytest.mark.parametrize("free_flyer", [False, True])
-def test_regressor_times_parameters_is_inverse_dynamics(name, free_flyer, rng):
-    model = RobotModel.from_urdf(example_urdf(name), free_flyer=free_flyer, terms=())
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [*((name, {"free_flyer": x}) for name in ROBOTS for x in (False, True)),
+     ("tiago.urdf", {"mimic": "coupled"}), ("panda.urdf", {"mimic": "coupled"})],
+)  # fmt: skip
+def test_columns_of_the_bodies_are_pinocchios_and_their_torque_is_inverse_dynamics(
+    name, options, rng
+):
+    model = RobotModel.from_urdf(example_urdf(name), terms=(), **options)
     q, v, a = states(model, rng)
-    tau = (joint_torque_regressor(model, q, v, a) @ model.standard_parameters()).reshape(v.shape)
-    data = model.pin_model.createData()
-    for k, configuration in enumerate(model.configurations(q)):
-        expected = pin.rnea(model.pin_model, data, configuration, v[k], a[k])
-        np.testing.assert_allclose(tau[k], expected, atol=1e-11 * np.abs(expected).max())
-
-
-def test_a_coupled_mimic_joint_loads_its_leader(rng):
-    path = example_urdf("panda.urdf")
-    coupled = RobotModel.from_urdf(path, mimic="coupled", terms=())
-    free = RobotModel.from_urdf(path, terms=())
-    assert len(coupled.joints) == 8
-    assert len(free.joints) == 9
-    q, v, a = states(coupled, rng)
-    G = coupled.velocity_map
-    full = joint_torque_regressor(free, q @ G.T, v @ G.T, a @ G.T) @ free.standard_parameters()
-    tau = joint_torque_regressor(coupled, q, v, a) @ coupled.standard_parameters()
-    np.testing.assert_allclose(tau.reshape(-1, 8), full.reshape(-1, 9) @ G, atol=1e-12)
+    engine, G, pi = model.pin_model, model.velocity_map, model.standard_parameters()
+    data, Y = engine.createData(), joint_torque_regressor(model, q, v, a)
+    rows = zip(model.configurations(q), v @ G.T, a @ G.T, strict=True)
+    for Y_k, state in zip(Y.reshape(*v.shape, -1), rows, strict=True):
+        columns = G.T @ pin.computeJointTorqueRegressor(engine, data, *state)
+        np.testing.assert_allclose(Y_k, columns, atol=1e-12)
+        torque = G.T @ pin.rnea(engine, data, *state)
+        np.testing.assert_allclose(Y_k @ pi, torque, atol=1e-11 * np.abs(torque).max())
 
 
 def test_a_coupled_drive_loads_every_joint_it_turns_with(ur5, rng):
@@ -98,9 +93,8 @@ def test_drives_of_a_transmission_are_what_its_motors_take(ur5, rng):
 @pytest.mark.parametrize("free_flyer", [False, True])
 def test_support_is_where_the_regressor_can_be_non_zero(free_flyer, rng):
     coupling = Coupling("motor", (("wrist_2_joint", 1.0), ("wrist_3_joint", 0.5)))
-    model = RobotModel.from_urdf(
-        example_urdf("ur5_robot.urdf"), free_flyer=free_flyer, couplings=(coupling,)
-    )
+    options = {"free_flyer": free_flyer, "couplings": (coupling,)}
+    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), **options)
     W = random_regressor(model, 30, rng).reshape(30, model.n_rows, -1)
     seen = np.abs(W).max(axis=0) > 1e-12
     assert not (seen & ~model.support).any()
@@ -124,9 +118,8 @@ def test_a_problem_streams_the_regressor_in_blocks_as_often_as_wanted(ur5, rng):
         blocks = list(problem.blocks())
         assert len(blocks) == 3
         np.testing.assert_array_equal(np.vstack([block[0] for block in blocks]), W)
-        np.testing.assert_array_equal(
-            np.concatenate([block[1] for block in blocks]), motion.tau.reshape(-1)
-        )
+        tau = np.concatenate([block[1] for block in blocks])
+        np.testing.assert_array_equal(tau, motion.tau.reshape(-1))
 
 
 def test_a_trajectory_of_other_joints_is_refused(ur5, panda, rng):
@@ -136,6 +129,10 @@ def test_a_trajectory_of_other_joints_is_refused(ur5, panda, rng):
         build_problem(ur5, trajectory(ur5, rng), np.ones(3))
     with pytest.raises(DataError, match=r"v and a have shapes"):
         joint_torque_regressor(ur5, np.zeros((2, 6)), np.zeros((2, 5)), np.zeros((2, 6)))
+    v = np.zeros((4, 6))
+    v[3, 1] = np.nan
+    with pytest.raises(DataError, match=r"v\[3\] of .* is nan, wanted a finite number"):
+        joint_torque_regressor(ur5, 0 * v, v, 0 * v)
 
 
 @pytest.mark.parametrize("robot", ["ur5", "panda"])
@@ -159,20 +156,3 @@ def test_samples_are_shuffled_without_loss(rng):
     # one of 8193 is drawn at a time: k draws leave each of the first as likely (1 - 1/8193)^k
     left = np.mean(np.array(found[4000:]) < 8192) * 16_000 / 8192
     assert left == pytest.approx((1 - 1 / 8193) ** 4000, abs=0.02)
-
-
-@pytest.mark.parametrize("name", ["ur5", "coupled"])
-def test_columns_of_the_bodies_are_pinocchios_and_nothing_else(ur5, rng, name):
-    model = ur5
-    if name == "coupled":
-        model = RobotModel.from_urdf(example_urdf("tiago.urdf"), mimic="coupled")
-    q, v, a = rng.uniform(-1.0, 1.0, (3, 40, len(model.joints)))
-    Y = joint_torque_regressor(model, q, v, a).reshape(40, model.n_rows, -1)
-    engine, G = model.pin_model, model.velocity_map
-    data = engine.createData()
-    for k, x in enumerate(model.configurations(q)):
-        whole = G.T @ pin.computeJointTorqueRegressor(engine, data, x, G @ v[k], G @ a[k])
-        np.testing.assert_allclose(Y[k, :, : whole.shape[1]], whole, atol=1e-12)
-    v[3, 1] = np.nan
-    with pytest.raises(DataError, match=r"v\[3\] of .* is nan, wanted a finite number"):
-        joint_torque_regressor(model, q, v, a)

@@ -1,8 +1,4 @@
-"""The real browser of the tests: the system's Chromium, driven by Playwright.
-
-Use the fixture ``browser`` (it is in conftest.py) and :func:`visit`. Without a Chromium tests are
-skipped with the reason, but never in CI.
-"""
+"""The browser of the tests, the system's Chromium, driven by Playwright: without it they skip."""
 
 import os
 import shutil
@@ -18,8 +14,7 @@ import pytest
 IN_CI = os.environ.get("CI") == "true"
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]  # no GPU needed
-#: Pages are put together by the processor, which emulates a GPU for 3-D views alone, and says so.
-FLAGS += ["--disable-gpu-compositing"]
+#: The processor puts pages together and emulates a GPU for 3-D views alone, which says so.
 OF_THE_EMULATION = (
     "GL Driver Message (OpenGL, Performance, GL_CLOSE_PATH_NV, High): GPU stall due to ReadPixels"
 )
@@ -37,15 +32,11 @@ NO_BROWSER = f"no browser: none of {', '.join(NAMES)} is on PATH; apt-get instal
 
 @dataclass
 class Visit:
-    """A page in the browser, and what went wrong on it.
-
-    ``errors`` has the console's errors and warnings and uncaught exceptions; ``requests`` every
-    address but that of the page itself and data: and blob: addresses, which leave no machine.
-    """
+    """A page in the browser, and what went wrong on it."""
 
     page: Any
-    errors: list[str] = field(default_factory=list)
-    requests: list[str] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)  # and warnings, uncaught exceptions
+    requests: list[str] = field(default_factory=list)  # of addresses that leave the machine
 
 
 def until(seen: Visit, expression: str, timeout: float = 20.0) -> None:
@@ -81,13 +72,16 @@ def visit(
     from playwright.sync_api import Error
 
     address = Path(target).resolve().as_uri() if isinstance(target, Path) else target
-    context = browser.new_context(viewport={"width": size[0], "height": size[1]}, **options)
-    try:
-        seen = _opened(context, address)
-    except Error:
-        context.close()
-        context = browser.new_context(viewport={"width": size[0], "height": size[1]}, **options)
-        seen = _opened(context, address)
+    options["viewport"] = {"width": size[0], "height": size[1]}
+    for attempt in range(2):
+        context = browser.new_context(**options)
+        try:
+            seen = _opened(context, address)
+            break
+        except Error:
+            context.close()
+            if attempt:
+                raise
     try:
         yield seen
     finally:

@@ -57,8 +57,7 @@ def _moments(model, pi):
 def written_result(plant, folder, *, position=None, limits=None, **changes):
     """Write the result of a plant whose drives were found exactly; return its folder.
 
-    Position is friction that depends on it by joint, as of ``by_position``; limits are effort
-    limits of the controller; changes are keys of result.json that are otherwise.
+    Position: by joint, as of ``by_position``; limits: of effort; changes: other keys of the result.
     """
     position = position or {}
     model = plant.model.with_terms({joint: terms for joint, (terms, _) in position.items()})
@@ -67,8 +66,8 @@ def written_result(plant, folder, *, position=None, limits=None, **changes):
     entries = drive_entries(plant)
     for joint, (terms, parameters) in position.items():
         for term, x in zip(terms, parameters, strict=True):
-            values[f"{joint}.{term.name}"] = x
             name = f"{joint}.{term.name}"
+            values[name] = x
             entries.append({"name": name, "value": x, "std_error": 0.1 * abs(x), "unit": "N m"})
     folder.mkdir(exist_ok=True)
     sidecar = write_urdf(model, np.array([*values.values()]), folder / "robot.urdf")

@@ -8,8 +8,7 @@ import numpy as np
 from robotid.data.log import Log
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Controller, Simulation
-from robotid.dynamics.simulation.simulator import Noise, simulate
-from robotid.dynamics.simulation.truth import another_robot
+from robotid.dynamics.simulation.simulator import Noise, another_robot, simulate
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

@@ -10,8 +10,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Sensors
-from robotid.dynamics.simulation.simulator import Noise
-from robotid.dynamics.simulation.truth import another_robot
+from robotid.dynamics.simulation.simulator import Noise, another_robot
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.identification.pipeline import with_drives

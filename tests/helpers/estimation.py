@@ -9,7 +9,7 @@ from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.problem import Problem
+from robotid.dynamics.factors import Problem
 from robotid.dynamics.torque import build_problem, joint_torque_regressor
 from robotid.estimation.estimators import (
     OLS,
@@ -45,11 +45,6 @@ class Case:
     def base(self, estimate):
         theta = estimate.theta
         return theta if len(theta) == len(self.beta) else self.mapping.to_base(theta)
-
-    def covariance(self, estimate):
-        K = self.mapping.K
-        same = len(estimate.theta) == len(self.beta)
-        return estimate.covariance if same else K @ estimate.covariance @ K.T
 
 
 class RandomStates(Case):

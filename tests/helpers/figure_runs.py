@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from helpers.corruptions import both, column, scaled, swap
 from helpers.hoist import (
     DRIVES,
     NOISE,
@@ -224,8 +225,6 @@ ESTIMATORS = {
 }
 OF_ESTIMATORS = ("base_parameters", "drive_parameters", "consistency", "uncertainty",
                  "identification", "validation", "verdict")  # fmt: skip
-OF_CHOICE = ("friction", "warnings", "drive_parameters", "drive_moments", "uncertainty", "inputs",
-             "identification", "validation")  # fmt: skip
 
 
 def estimators(folder):
@@ -247,6 +246,8 @@ def estimators(folder):
     return runs, {"hoist": hoist, "results": found}
 
 
+OF_CHOICE = ("friction", "warnings", "drive_parameters", "drive_moments", "uncertainty", "inputs",
+             "identification", "validation")  # fmt: skip
 CHOICE_DRIVES = DRIVES | {
     "lift": Drive(0.9, 2.2, 2.1, -0.8, load=0.12),
     "reach": Drive(2.4, 14.0, 6.0, 1.5, spring=35.0),
@@ -268,7 +269,7 @@ def choice(folder):
         runs.run(name, f"identify @{name}.toml --out @{name} --verbose")
         found[name] = runs.keep(
             f"{name}.json", f"{name}/result.json",
-            lambda x: {key: content for key, content in brief(x).items() if key in OF_CHOICE},
+            lambda x: {key: brief(x).get(key) for key in OF_CHOICE},
         )  # fmt: skip
     return runs, {"hoist": hoist, "results": found}
 
@@ -411,9 +412,7 @@ def faults(folder):
         table[seed] = {"time": t + 10 * (seed - 70)} | columns_of(THREE, q, dq=v, tau=tau)
     for name, change in FAULTS.items():
         for seed, columns in table.items():
-            spoilt = {key: x.copy() for key, x in columns.items()}
-            change(spoilt)
-            write_table(folder / f"{name}_{seed}.csv", spoilt)
+            write_table(folder / f"{name}_{seed}.csv", change(columns))
         stated = "--torque-delay 0.012" if name == "late" else ""
         line = f"doctor @hoist.urdf @{name}_71.csv @{name}_72.csv {ROBOT} {stated} --json"
         runs.run(name, line, code=None)
@@ -431,37 +430,24 @@ def faults(folder):
     return runs, {"hoist": hoist}
 
 
-def _late(columns):
-    for name in [key for key in columns if key.startswith("tau_")]:
-        columns[name] = np.roll(columns[name], 4)
-    columns["dq_reach"] = np.roll(columns["dq_reach"], 1)
-
-
-def _swapped(columns):
-    columns["tau_lift"], columns["tau_reach"] = columns["tau_reach"], columns["tau_lift"]
-
-
-def _scaled(columns):
-    columns["tau_lift"] *= 0.5
-    columns["dq_roll"] *= 60 / (2 * np.pi)
-
-
-def _spoilt(columns):
-    columns["time"][400:] += 0.35
-    columns["tau_lift"][200:206:2] += 400.0
-    columns["tau_reach"] = np.clip(columns["tau_reach"], -14.0, 11.0)
-    columns["tau_roll"] = np.round(columns["tau_roll"] / 0.4) * 0.4
-    columns["q_reach"][600:660] = columns["q_reach"][600]
-    columns["dq_lift"] = np.roll(columns["dq_lift"], 3)
-
-
-def _turned(columns):
-    columns["tau_roll"] *= -1
-    columns["q_lift"] += 0.3
-
-
-FAULTS = {"late": _late, "swapped": _swapped, "scaled": _scaled, "spoilt": _spoilt,
-          "turned": _turned}  # fmt: skip
+_CHANGES = {
+    "time": lambda x: np.where(np.arange(len(x)) < 400, x, x + 0.35),
+    "tau_lift": lambda x: x + 400.0 * np.isin(np.arange(len(x)), (200, 202, 204)),
+    "tau_reach": lambda x: np.clip(x, -14.0, 11.0),
+    "tau_roll": lambda x: np.round(x / 0.4) * 0.4,
+    "q_reach": lambda x: np.where(np.arange(len(x)) // 60 == 10, x[600], x),
+    "dq_lift": lambda x: np.roll(x, 3),
+}
+#: By name: what is done with the columns of a log.
+FAULTS = {
+    "late": both(
+        column("tau_", lambda x, _t: np.roll(x, 4)), column("dq_reach", lambda x, _t: np.roll(x, 1))
+    ),
+    "swapped": swap(("tau_lift", "tau_reach")),
+    "scaled": both(scaled("tau_lift", 0.5), scaled("dq_roll", 60 / (2 * np.pi))),
+    "spoilt": lambda table: table | {key: change(table[key]) for key, change in _CHANGES.items()},
+    "turned": both(scaled("tau_roll", -1), column("q_lift", lambda x, _t: x + 0.3)),
+}  # fmt: skip
 
 
 def tracked(folder):

@@ -18,7 +18,7 @@ from robotid.diagnosis.urdf.inspection import inspect_urdf
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.output.files.urdf import write_urdf
 from robotid.output.viewer.replays import robot_scene
-from robotid.robot.geometry import body_boxes
+from robotid.robot.bodies import body_boxes
 from robotid.robot.mass_matrix import check_mass_matrix
 from robotid.robot.model import RobotModel
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from robotid.data.log import Log
 from robotid.dynamics.simulation.motions import random_fourier
-from robotid.dynamics.simulation.truth import another_robot
+from robotid.dynamics.simulation.simulator import another_robot
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.parameters import Coupling
 

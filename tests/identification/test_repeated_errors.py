@@ -12,8 +12,8 @@ from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.constraint_rows import constraint_jacobian, touching
-from robotid.dynamics.prediction import predict
 from robotid.dynamics.prepared_logs import base_problem
+from robotid.dynamics.torque import predict
 from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.identification.repeated_errors import (
     EstimatedErrors,

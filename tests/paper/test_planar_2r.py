@@ -1,8 +1,5 @@
 """The closed-form arm against Pinocchio, the printed definitions and the laws of mechanics."""
 
-import xml.etree.ElementTree as ET
-from pathlib import Path
-
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -16,7 +13,6 @@ from robotid.paper.planar_2r import (
     urdf_text,
 )
 
-URDF = Path(__file__).parents[2] / "urdf" / "planar_2r.urdf"
 FORMS = tuple(PARAMETER_NAMES)
 #: Another possible arm, every field unlike the others, so that no term can hide behind a 0 or 1.
 OTHER_LINKS = PlanarLinks(0.7, 0.4, 3.0, -0.3, 0.05, 0.9, 2.0, -0.15, -0.08, 0.3)
@@ -80,19 +76,3 @@ def test_printed_regressor_is_wrong_in_both_rows_of_column_4_only():
         expected = np.zeros((2, 5))
         expected[:, 3] = np.sin(q[1]) * (v @ v) * np.array([1.0, -1.0])
         np.testing.assert_allclose(wrong, expected, atol=1e-12)
-
-
-@ARMS
-def test_urdf_keeps_every_digit_and_moves_to_the_proximal_frames(links):
-    robot = ET.fromstring(urdf_text(links))
-    assert [link.get("name") for link in robot.iter("link")] == ["base_link", "link_1", "link_2"]
-    assert [joint.get("name") for joint in robot.iter("joint")] == ["joint_1", "joint_2"]
-    origins = [joint.find("origin").get("xyz").split() for joint in robot.iter("joint")]
-    assert [float(xyz[0]) for xyz in origins] == [0.0, links.L1]
-    coms = [
-        list(map(float, com.get("xyz").split())) for com in robot.iterfind("link/inertial/origin")
-    ]
-    assert coms[0] == [links.L1 + links.xbar1, links.ybar1, 0.0]
-    assert coms[1] == [links.L2 + links.xbar2, links.ybar2, 0.0]
-    assert [float(mass.get("value")) for mass in robot.iter("mass")] == [links.m1, links.m2]
-    assert [float(inertia.get("izz")) for inertia in robot.iter("inertia")] == list(links.central)

@@ -1,30 +1,36 @@
 """The equations and the procedure (11)-(25), on the paper's arm and on a UR5 under gravity."""
 
+import re
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from helpers.synthetic import truth
 
-from robotid.base.exceptions import RankDeficientError
+from robotid.base.exceptions import RankDeficientError, SettingsError
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.motions import ProgramMotion
 from robotid.dynamics.simulation.simulator import RobotPlant
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.paper import planar_2r
-from robotid.paper.procedure import (
+from robotid.paper import planar_2r, study
+from robotid.paper.planar_2r import PAPER_PARAMETERS
+from robotid.paper.study import (
     Influences,
     LinearDynamics,
     LoopSettings,
+    PaperSettings,
+    energy_drift,
     one_shot,
+    paper_arm,
+    planar_dynamics,
     proximity,
+    random_runs,
     recursive_update,
     rk4,
     run_procedure,
-    smallest_eigenvalue,
+    study_model,
 )
-from robotid.paper.study import planar_dynamics
 
 P4 = planar_2r.parameters(planar_2r.PAPER_LINKS)
 ARM = planar_dynamics()
@@ -66,14 +72,10 @@ def test_at_the_true_parameters_prx_is_zero_and_the_procedure_stops_at_once():
     np.testing.assert_array_equal(history.estimates[-1], [P4])
 
 
-@pytest.mark.parametrize(
-    ("form", "P", "left"),
-    [
-        ("printed", planar_2r.PAPER_PARAMETERS, 0.1011),
-        ("corrected_five", planar_2r.PAPER_PARAMETERS, 0.09915),
-        ("corrected", P4, 0.09864),
-    ],
-)
+@pytest.mark.parametrize(("form", "P", "left"), [
+    ("printed", planar_2r.PAPER_PARAMETERS, 0.1011), ("corrected", P4, 0.09864),
+    ("corrected_five", planar_2r.PAPER_PARAMETERS, 0.09915),
+])  # fmt: skip
 def test_the_recursion_finds_the_papers_parameters(form, P, left):
     dynamics = planar_dynamics(form)
     history = run_procedure(
@@ -86,33 +88,6 @@ def test_the_recursion_finds_the_papers_parameters(form, P, left):
     assert 0.10 < error[10] < 0.16
     assert error[-1] == pytest.approx(left, rel=1e-3)
     assert (np.diff(error) < 0).all()
-
-
-def test_the_error_never_grows_while_the_guarantee_holds(rng):
-    # sigma_min(D(q, P^)) <= 2 sigma_min(D(q, P)), checked at every q2 and every estimate
-    guesses = P4 * rng.uniform(0.3, 1.3, (8, 4))
-    motion = ProgramMotion(rng.uniform(0.5, 2.0, (8, 2)), rng.uniform(1, 3, 8))
-    history = run_procedure(
-        ARM, PLANT, motion, guesses, settings=short(6), offset=rng.uniform(-0.1, 0.1, (8, 2))
-    )
-    q = np.column_stack([np.zeros(73), np.linspace(-np.pi, np.pi, 73)])
-    true = smallest_eigenvalue(ARM.mass_matrix(q, P4))
-    for P in history.estimates.reshape(-1, 4):
-        assert (smallest_eigenvalue(ARM.mass_matrix(q, P)) <= 2 * true).all()
-    assert (np.diff(history.relative_error(P4), axis=0) < 0).all()
-
-
-def test_noise_makes_the_smallest_samples_dangerous_and_eps2_leaves_them_out():
-    # at depend on the program Psi is all noise, and (24) divides by its square
-    bare, guarded = (
-        run(P4, settings=short(2, eps2=eps2), influences=noise(1)).relative_error(P4)[-1, 0]
-        for eps2 in (1e-12, 1.0)
-    )
-    assert 10 * guarded < bare  # 0.003 and 0.6
-
-
-def noise(seed):
-    return Influences(q=1e-5, v=1e-4, a=1e-2, rng=np.random.default_rng(seed))
 
 
 def test_an_impossible_guess_is_not_updated_and_a_runaway_is_told():
@@ -135,15 +110,6 @@ def states(rng, count, n):
     return rng.uniform(-np.pi, np.pi, (count, n)), *rng.uniform(-3, 3, (2, count, n))
 
 
-def test_mass_matrix_from_base_parameters_is_pinocchios_crba(arm, ur5, rng):
-    pi = ur5.standard_parameters()
-    q, _, _ = states(rng, 10, 6)
-    data = ur5.pin_model.createData()
-    for D, q_k in zip(arm.mass_matrix(q, structural_mapping(ur5).to_base(pi)), q, strict=True):
-        M = pin.crba(ur5.pin_model, data, q_k)
-        np.testing.assert_allclose(D, np.triu(M) + np.triu(M, 1).T, atol=1e-12)
-
-
 def test_a_linear_plant_moves_as_the_robot_does(arm, ur5, rng):
     pi = truth(ur5)
     q, v, u = states(rng, 10, 6)
@@ -151,13 +117,6 @@ def test_a_linear_plant_moves_as_the_robot_does(arm, ur5, rng):
     ours = arm.acceleration(q, v, 20 * u, structural_mapping(ur5).to_base(pi))
     # wrist inertias of 0.1 kg m^2 multiply rounding of 50 N m
     np.testing.assert_allclose(ours, RobotPlant(ur5, pi).acceleration(q, v, 20 * u), rtol=1e-9)
-
-
-def test_acceleration_solves_the_dynamics(rng):
-    dynamics, P = planar_dynamics("printed"), planar_2r.PAPER_PARAMETERS
-    q, v, u = states(rng, 20, 2)
-    a = dynamics.acceleration(q, v, u, P)
-    np.testing.assert_allclose(dynamics.torque(q, v, a, P), u, atol=1e-12)
 
 
 def test_proximity_is_the_gradient_of_the_criterion(rng):
@@ -171,33 +130,15 @@ def test_proximity_is_the_gradient_of_the_criterion(rng):
     np.testing.assert_allclose(proximity(Psi, P, u), slopes, atol=1e-8)
 
 
-def test_the_proximity_vanishes_at_the_truth(rng):
-    Psi, P = rng.normal(size=(3, 2, 5)), rng.normal(size=(3, 5))
-    u = np.einsum("rnc,rc->rn", Psi, P)
-    np.testing.assert_allclose(proximity(Psi, P, u), 0.0, atol=1e-14)
-
-
-@pytest.mark.parametrize(
-    ("change", "why"),
-    [
-        ({"is_open": np.array(False)}, "PRX is zero"),
-        ({"eps2": 1e9}, "the sample is small"),
-        ({"sigma": np.array(-0.1)}, "D is not positive definite"),
-    ],
-)
+@pytest.mark.parametrize(("change", "why"), [
+    ({"is_open": np.array(False)}, "PRX is zero"), ({"eps2": 1e9}, "the sample is small"),
+    ({"sigma": np.array(-0.1)}, "D is not positive definite"),
+])  # fmt: skip
 def test_an_update_is_left_out_where(change, why, rng):
     P, Psi, eta = rng.normal(size=5), rng.normal(size=(2, 5)), rng.normal(size=2)
     arguments = {"sigma": np.array(1.0), "is_open": np.array(True), **change}
     found = recursive_update(P, Psi, eta, **arguments)
     np.testing.assert_array_equal(found, P, err_msg=why)
-
-
-def test_one_shot_finds_the_truth_from_any_guess(rng):
-    G, P, P_hat = rng.normal(size=(40, 5)), rng.normal(size=5), rng.normal(size=5)
-    # G_* with G P = G_* P^: any matrix, moved along P^ so that the torques agree
-    G_star = rng.normal(size=(40, 5))
-    G_star += np.outer(G @ P - G_star @ P_hat, P_hat) / (P_hat @ P_hat)
-    np.testing.assert_allclose(one_shot(G, G_star, P_hat, "abcde"), P, rtol=1e-12)
 
 
 def test_one_shot_names_what_the_motion_leaves_open(rng):
@@ -278,3 +219,93 @@ def test_an_iteration_is_its_equations_update_by_update(rng):
     np.testing.assert_allclose(history.torques, [torques], rtol=1e-9)
     assert (largest > prx).any()  # of an update before the last
     np.testing.assert_array_equal([history.NA, history.diverged], np.zeros((2, 2)))
+
+
+def test_the_physical_arm_has_four_parameters_and_the_others_the_papers_five():
+    for name in ("printed", "corrected"):
+        np.testing.assert_array_equal(paper_arm(name)[1], PAPER_PARAMETERS)
+    np.testing.assert_allclose(paper_arm("physical")[1], [22, 5, 3, 0.1], rtol=1e-14)
+    with pytest.raises(SettingsError, match=r"^model is 'other', wanted one of printed, corrected"):
+        paper_arm("other")
+
+
+def test_one_shot_needs_one_run_and_disturbance_shows():
+    study = study_model("physical", PaperSettings(iterations=2, longest=1))
+    assert study.one_shot_error < 1e-12
+    assert study.errors("disturbed")[1] != study.errors()[1]
+    assert study.errors("noisy")[1] != study.errors()[1]
+    assert study.errors("on_program")[1] > study.errors()[1]
+
+
+def test_only_the_physical_arm_keeps_its_energy():
+    t, gained = energy_drift(duration=4.0, dt=4e-3)
+    np.testing.assert_allclose(t, np.linspace(0.0, 4.0, 1001), atol=1e-12)
+    assert {len(share) for share in gained.values()} == {1001}
+    assert np.abs(gained["physical"]).max() < 1e-9  # error of the integration
+    assert np.abs(gained["printed"]).max() > 0.2
+    assert np.abs(gained["corrected"]).max() > 0.1  # p3 != p4
+
+
+def test_random_runs_tell_every_failure(rng):
+    dynamics, P = paper_arm("physical")
+    runs = random_runs(dynamics, P, 8, 12, rng)
+    content = runs.to_dict()
+    assert 0 < content["converged"] < 8
+    assert (content["runs"], content["most_iterations"], content["tolerance"]) == (8, 12, 1e-3)
+    for failure in content["failures"]:
+        assert runs.errors[:, failure["run"]].min() >= 1e-3
+        assert re.match(r"slow: the error is .* after 12 iterations", failure["reason"])
+    converged = np.setdiff1d(np.arange(8), [failure["run"] for failure in content["failures"]])
+    for number, r in zip(content["iterations"], converged, strict=True):
+        assert runs.errors[number, r] < 1e-3 <= runs.errors[number - 1, r]
+
+
+def test_a_random_run_is_critically_damped_at_its_bandwidth(rng):
+    dynamics, P = paper_arm("physical")
+    runs = random_runs(dynamics, P, 2, 1, rng)
+    drawn = runs.drawn
+    for r, w in enumerate(drawn["gain"]):
+        history = run_procedure(
+            dynamics,
+            partial(dynamics.acceleration, P=P),
+            ProgramMotion(drawn["amplitude"][r], drawn["duration"][r]),
+            drawn["guess"][[r]],
+            settings=LoopSettings(alpha=2 * w, beta=w**2, iterations=1),
+            offset=drawn["offset"][r],
+        )
+        np.testing.assert_allclose(history.relative_error(P)[:, 0], runs.errors[:, r], rtol=1e-9)
+        np.testing.assert_allclose(history.tracking[:, 0], runs.history.tracking[:, r], rtol=1e-9)
+
+
+@pytest.mark.parametrize(("change", "reason"), [
+    ({"diverged": 3}, "the robot diverged from its program in iteration 3"),
+    ({"skipped": 7}, "slow: the error is 0.4 after 1 iterations, with a decrease of 20 % in the "
+     "last 1; 7 updates were omitted, since D(q, P^) was not positive definite"),
+    ({"errors": [0.5, 0.6]}, "the error increased: from 0.5 to 0.6"),
+    ({"errors": [0.5, 0.5]}, "stalled: the motion excites too little; the error is 0.5"),
+    ({"errors": [0.9, 0.8, 0.5, *[0.48] * 9, 0.45]},
+     "slow: the error is 0.45 after 12 iterations, with a decrease of 10 % in the last 10"),
+    ({"errors": [0.8, *[0.7] * 8, 0.6]},
+     "slow: the error is 0.6 after 9 iterations, with a decrease of 25 % in the last 9"),
+    ({"errors": [0.9, *[0.4] * 11]},
+     "stalled: the motion excites too little; the error is 0.4"),
+])  # fmt: skip
+def test_each_kind_of_failure_has_its_reason(change, reason, rng):
+    dynamics, P = paper_arm("physical")
+    runs = random_runs(dynamics, P, 1, 1, rng)
+    errors = np.array(change.pop("errors", [0.5, 0.4]))[:, None]
+    history = replace(runs.history, **{key: np.array([x]) for key, x in change.items()})
+    found = replace(runs, errors=errors, history=history).to_dict()["failures"]
+    assert [failure["reason"] for failure in found] == [reason]
+
+
+def test_each_case_has_its_own_disturbance_and_noise(rng):
+    cases = list(study.CASES.values())
+    found = study._influences(cases, np.random.default_rng(4))
+    is_noisy = np.array([[0.0], [0.0], [0.0], [1.0], [1.0]])
+    for level, size in ((found.q, 1e-5), (found.v, 1e-4), (found.a, 1e-2)):
+        np.testing.assert_array_equal(level, size * is_noisy)
+    u = rng.standard_normal((5, 2))
+    wanted = np.array([[0.0], [0.0], [0.1], [0.0], [0.0]]) * u
+    wanted *= np.random.default_rng(4).uniform(-1.0, 1.0, (5, 2))
+    np.testing.assert_allclose(found.torque(np.zeros(5), u), wanted)

@@ -1,7 +1,6 @@
 """What a run of the paper's simulation writes: files, paper.json and, cell by cell, its page."""
 
 import json
-import math
 import re
 from functools import partial
 from types import SimpleNamespace
@@ -11,9 +10,15 @@ import pytest
 from helpers.pages import chart, charts, number, tables
 
 from robotid.paper import run as paper
-from robotid.paper.procedure import LoopSettings
 from robotid.paper.run import run_paper
-from robotid.paper.study import CASES, MODELS, PaperSettings, energy_drift, study_model
+from robotid.paper.study import (
+    CASES,
+    MODELS,
+    LoopSettings,
+    PaperSettings,
+    energy_drift,
+    study_model,
+)
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import INERTIAL_TERMS
 
@@ -59,18 +64,6 @@ def test_the_json_has_the_schema_of_the_design(written):
             assert len(found[case][name]["relative_error"]) == 20
             assert found[case][name]["converged"] is False
             assert found[case][name]["reason"]
-
-
-def test_every_number_is_finite(written):
-    def numbers(value):
-        if isinstance(value, dict):
-            value = list(value.values())
-        if isinstance(value, list):
-            return [x for part in value for x in numbers(part)]
-        return [value] if isinstance(value, float) else []
-
-    assert len(numbers(written[1])) > 100
-    assert all(math.isfinite(x) for x in numbers(written[1]))
 
 
 def test_the_page_is_whole_and_offline(written):

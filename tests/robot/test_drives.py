@@ -17,14 +17,20 @@ from robotid.cli.identify import identify
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
-from robotid.dynamics import prediction
+from robotid.dynamics import torque
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.friction_projection import drive_moments, project_friction
-from robotid.dynamics.prediction import drive_motion_along, predict, remember
 from robotid.dynamics.rows import COMPILED, TrajectoryRows
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulator import RobotPlant
-from robotid.dynamics.torque import InstantRegressor, joint_torque_regressor, trajectory_regressor
+from robotid.dynamics.torque import (
+    InstantRegressor,
+    drive_motion_along,
+    joint_torque_regressor,
+    predict,
+    remember,
+    trajectory_regressor,
+)
 from robotid.output.files.mjcf import write_mjcf
 from robotid.output.files.urdf import load_identified, read_sidecar, write_urdf
 from robotid.output.report.pictures import friction_chart
@@ -224,18 +230,6 @@ def test_it_is_written_and_read_back(model, term, rng, tmp_path):
         assert f'{term.dynamics}="{value}"' in (tmp_path / "arm.urdf").read_text()
 
 
-def test_the_layout_knows_its_sign_size_and_preference(model, term):
-    layout, drives = model.layout, drive_part(model)
-    assert set(layout.is_nonnegative()[drives]) == {term.is_nonnegative}
-    assert set(layout.preference()[drives]) == {term.preference}
-    assert set(layout.scales(0.5)[drives]) == {0.25 if term.is_inertia else 1.0}
-    assert [name.split(".")[0] for name in layout.drive_names] == [
-        *JOINTS, *(["motor"] if term.is_shared else []),
-    ]  # fmt: skip
-    assert {found for _, found in layout.drive_parameters} == {term}
-    np.testing.assert_array_equal(layout.drive_loads, R[: len(layout.drives)].T)
-
-
 def test_terms_of_one_drive_stand_side_by_side():
     own = {"elbow_joint": [LoadFriction(), Tanh(speed=0.2)], "motor": [Cubic()]}
     model = RobotModel.from_urdf(
@@ -310,16 +304,9 @@ def test_a_late_torque_is_to_first_order_its_rate(rng):
     motion = random_fourier(model, rng)
     q, v, a = motion.evaluate(t)
     x = Trajectory(
-        t=t,
-        q=q,
-        v=v,
-        a=a,
-        tau=0 * q,
-        joints=JOINTS,
-        rate=200.0,
-        segment=np.zeros(600, dtype=int),
-        direction=np.tanh(v @ R[:3].T / 0.3),
-    )
+        t=t, q=q, v=v, a=a, tau=0 * q, joints=JOINTS, rate=200.0,
+        segment=np.zeros(600, dtype=int), direction=np.tanh(v @ R[:3].T / 0.3),
+    )  # fmt: skip
     with_lag = predict(model, [pi], remember(model, x))[0]
     punctual = replace(x, memory=np.zeros((600, 3)))
     on_time = predict(model, [pi], punctual)[0]
@@ -377,7 +364,7 @@ def test_a_hook_that_only_slow_motion_shows_is_a_base_parameter():
 
 
 def test_what_drives_remember_is_of_the_model_not_of_what_was_remembered_before(rng, monkeypatch):
-    monkeypatch.setattr(prediction, "_START", 10**9)  # by rows, which check the memory
+    monkeypatch.setattr(torque, "_START", 10**9)  # by rows, which check the memory
     path, own = example_urdf("ur5_robot.urdf"), {"elbow_joint": [LoadFriction(), Lag()]}
     model = RobotModel.from_urdf(path, joints=JOINTS, own_terms=own)
     x, other = states(rng), model.with_reference(truth(model))

@@ -6,8 +6,7 @@ from helpers.hostile_urdfs import FILES
 
 from robotid.diagnosis.urdf.inspection import inspect_urdf
 from robotid.output.viewer.replays import robot_scene
-from robotid.robot.examples import example_urdfs
-from robotid.robot.geometry import (
+from robotid.robot.bodies import (
     body_boxes,
     body_points,
     find_mesh,
@@ -15,6 +14,7 @@ from robotid.robot.geometry import (
     read_shapes,
     read_surfaces,
 )
+from robotid.robot.examples import example_urdfs
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.tree import parse_urdf

@@ -12,8 +12,8 @@ from hypothesis import HealthCheck, given, settings
 
 from robotid.base.exceptions import DataError, ModelError, SettingsError
 from robotid.diagnosis.urdf.inspection import inspect_urdf
+from robotid.robot.bodies import find_mesh, read_surfaces
 from robotid.robot.examples import example_urdf
-from robotid.robot.geometry import find_mesh, read_surfaces
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
 

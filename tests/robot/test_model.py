@@ -10,8 +10,7 @@ import pytest
 from helpers.robots import ROBOTS, motion, possible_parameters
 
 from robotid.base.exceptions import DataError, ModelError
-from robotid.dynamics.prediction import predict_instants
-from robotid.dynamics.torque import joint_torque_regressor
+from robotid.dynamics.torque import joint_torque_regressor, predict_instants
 from robotid.robot.constraints import Contact
 from robotid.robot.drives import Cubic, LoadFriction
 from robotid.robot.examples import example_urdf, example_urdfs

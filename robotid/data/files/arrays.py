@@ -12,12 +12,11 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from robotid.base.exceptions import DataError
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.typing import Array
 from robotid.data.base_motion import ACCELERATION, POSE, TWIST, in_base
 from robotid.data.files.columns import is_quantity
 from robotid.data.files.table import Format, Table, choose, load_package, parsing
-from robotid.data.log import suggestion
 from robotid.data.signal_settings import LogSource
 
 _CLOCKS = ("time", "t")
@@ -225,11 +224,8 @@ def _joint_columns(
 
 
 def _base_columns(where: str, arrays: Mapping[str, _Entry], joints: int) -> dict[str, _Column]:
-    """Return the columns of a floating base in arrays of a simulator.
-
-    MuJoCo's v has the world's axes, w the base's: the rate of v with the base's axes is R^T dv/dt -
-    w x v. Isaac Lab's state of the root has both with the world's axes.
-    """
+    """Return the columns of a floating base in arrays of a simulator."""
+    # MuJoCo's v has the world's axes, w the base's; Isaac Lab's both have the world's
     root = next((name for name in _ROOTS if name in arrays), "")
     if joints and "qpos" in arrays and arrays["qpos"].width == joints + 7:
         names = [name for name in ("qpos", "qvel", "qacc") if name in arrays]

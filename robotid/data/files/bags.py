@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from robotid.base.exceptions import DataError
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.typing import Array
 from robotid.data.base_motion import IMU, POSE, TWIST, continuous_signs
 from robotid.data.files.table import Format, Table, choose, load_package
-from robotid.data.log import repeated, suggestion
+from robotid.data.log import repeated
 from robotid.data.signal_settings import LogSource
 
 _STATE = "sensor_msgs/msg/JointState"
@@ -85,11 +85,7 @@ class _Bag:
 
 
 def _open(path: Path, source: LogSource) -> Table:
-    """Return the table of a .mcap, .db3 or .bag file, or of the folder of a ROS 2 bag.
-
-    Columns are ``time`` [s] since the epoch, ``position_<joint>``, ``velocity_<joint>`` and
-    ``effort_<joint>``; of Unitree's LowState by the number of the motor.
-    """
+    """Return the table of a .mcap, .db3 or .bag file, or of a folder: as ``position_<joint>``."""
     with _opened(path, source) as bag:
         sensors = _sensors_of(bag)
         topic, types = _choose_topic(bag), bag.types

@@ -14,9 +14,9 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.base.findings import listed, quoted, toml_key
+from robotid.base.findings import listed, quoted, suggestion, toml_key
 from robotid.base.settings import is_number
-from robotid.data.log import repeated, suggestion
+from robotid.data.log import repeated
 from robotid.data.signal_settings import LogSource, Transmission
 from robotid.robot.tree import Joint
 

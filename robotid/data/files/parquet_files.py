@@ -15,11 +15,11 @@ import numpy as np
 
 from robotid.base.exceptions import DataError
 from robotid.base.files import DATASET, missing_file, read_json
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.typing import Array
 from robotid.data.files.columns import named_by_row
 from robotid.data.files.table import Format, Place, RowReader, Table, choose, load_package, parsing
-from robotid.data.log import repeated, suggestion
+from robotid.data.log import repeated
 from robotid.data.signal_settings import LogSource
 
 _TEXTS = ("string", "large_string")  # types of columns
@@ -49,8 +49,7 @@ PARQUET = Format((".parquet",), _open, _write, written=(".parquet",))
 
 def load_pyarrow(purpose: str) -> ModuleType:
     """Return pyarrow, with pyarrow.parquet imported."""
-    package: ModuleType = load_package(purpose, "parquet", "pyarrow", "pyarrow.parquet")[0]
-    return package
+    return load_package(purpose, "parquet", "pyarrow", "pyarrow.parquet")[0]
 
 
 @dataclass(frozen=True)

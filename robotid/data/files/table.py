@@ -9,15 +9,15 @@ from functools import cache, cached_property, partial
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Protocol, TypeGuard
 
 import numpy as np
 
 from robotid.base.exceptions import DataError, MissingDependencyError, RobotIdError
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.typing import Array
 from robotid.data.files.columns import is_clock, named_by_row, quantity_of
-from robotid.data.log import suggestion
 from robotid.data.signal_settings import LogSource
 
 _CLOCK = "__time"  # PlotJuggler's
@@ -288,7 +288,7 @@ def choose(where: str, candidates: Sequence[str], noun: str, listing: str) -> st
     )
 
 
-def load_package(purpose: str, extra: str, *modules: str) -> list[Any]:
+def load_package(purpose: str, extra: str, *modules: str) -> list[ModuleType]:
     """Return modules of a package that an extra of robotid installs."""
     try:
         return [import_module(name) for name in modules]

@@ -22,8 +22,8 @@ from robotid.dynamics.constraint_rows import (
     touching,
     without_forces,
 )
-from robotid.dynamics.prediction import predict
 from robotid.dynamics.prepared_logs import closed_log, with_contacts
+from robotid.dynamics.torque import predict
 from robotid.robot.constraints import Contact, link_positions
 from robotid.robot.model import RobotModel
 
@@ -120,9 +120,8 @@ def check_wrenches(model: RobotModel, log: str, motion: Trajectory) -> Iterator[
     factor = float(np.sum(caused * left)) / square if square > 0.0 else 1.0
     if _ALIKE[0] <= factor <= _ALIKE[1]:
         return
-    what = next(
-        (x for x, unit in _FORCE_UNITS.items() if _ALIKE[0] < factor / unit < _ALIKE[1]), "unit"
-    )
+    units = (x for x, unit in _FORCE_UNITS.items() if _ALIKE[0] < factor / unit < _ALIKE[1])
+    what = next(units, "unit")
     if abs(factor + 1.0) < 1.0 - _ALIKE[0]:
         factor, what = -1.0, "reversed"
     stated, best = (rms((left - x * caused)[:, :3]) for x in (1.0, factor))
@@ -153,9 +152,8 @@ def _check_feet(model: RobotModel, log: Log, motion: Trajectory, flags: Array) -
         velocity = (velocity - np.nanmedian(standing, axis=1)[:, None]) * pairs
     squares = np.sum(velocity**2, axis=2)
     for k, contact in enumerate(model.contacts):
-        stated = (
-            np.ones(len(log.t), dtype=bool) if contact.always else log.contacts.get(contact.frame)
-        )
+        always = np.ones(len(log.t), dtype=bool)
+        stated = always if contact.always else log.contacts.get(contact.frame)
         if stated is None or contact.is_measured:  # found from this motion, or not needed
             continue
         touches, link = _at(stated, log, motion.t), contact.frame
@@ -169,10 +167,8 @@ def _check_feet(model: RobotModel, log: Log, motion: Trajectory, flags: Array) -
                     before=before, after=after,
                 )  # fmt: skip
                 continue
-        in_contact, apart = (
-            float(np.sqrt(squares[at, k].mean())) if at.any() else np.inf
-            for at in (touches, ~touches)
-        )
+        both = (squares[at, k] for at in (touches, ~touches))
+        in_contact, apart = (float(np.sqrt(x.mean())) if len(x) else np.inf for x in both)
         if _SLIDES < in_contact < np.inf and (in_contact > _STANDS * apart or touches.all()):
             yield finding("moving_contact", log.name, subject=link, link=link, speed=in_contact)
 

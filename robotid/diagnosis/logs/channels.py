@@ -7,16 +7,9 @@ import numpy as np
 from robotid.base.findings import Finding, listed, quoted
 from robotid.base.text import seconds
 from robotid.base.typing import Array
+from robotid.data import units
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
-from robotid.data.units import (
-    COARSE,
-    LARGEST_LAG,
-    is_trustworthy,
-    quantum,
-    unlike_velocities,
-    velocity_lags,
-)
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import AGREES, BEYOND_NOISE, DIFFERS, SHARE_OF_ROWS
 from robotid.robot.parameters import ParameterLayout
@@ -64,7 +57,7 @@ def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
         yield from _quantisation(log, kind, values, signals.velocity)
     for kind, values in channels.items():
         is_used = kind != "dq" or signals.velocity == "measured"
-        is_used = is_used or (signals.velocity == "auto" and is_trustworthy(log))
+        is_used = is_used or (signals.velocity == "auto" and units.is_trustworthy(log))
         yield from _spikes(log, kind, values, noise[kind], is_used=is_used)
     for kind, values in channels.items():
         yield from _noise(log, kind, values, noise[kind])
@@ -82,10 +75,10 @@ def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
 def _quantisation(log: Log, kind: str, values: Array, velocity: str) -> Iterator[Finding]:
     """Yield the joints with a quantised channel: those of few steps, and the others."""
     is_used = kind == "tau" or (kind == "dq" and velocity != "differentiated")
-    steps = np.array([quantum(x) for x in values.T])
+    steps = np.array([units.quantum(x) for x in values.T])
     count = np.ptp(values, axis=0) / np.where(steps > 0, steps, 1.0)
     for few in (True, False):
-        chosen = np.flatnonzero((steps > 0) & ((count < COARSE) == few))
+        chosen = np.flatnonzero((steps > 0) & ((count < units.COARSE) == few))
         if len(chosen) == 0:
             continue
         step = float(steps[chosen].max())
@@ -99,7 +92,7 @@ def _quantisation(log: Log, kind: str, values: Array, velocity: str) -> Iterator
         yield finding(
             "quantised", log.name, names, subject=kind, todo=todo, channel=kind,
             severity="warning" if few and is_used else "note", step=step, bits=round(bits),
-            coarse=COARSE, fewest=count[chosen].min(),
+            coarse=units.COARSE, fewest=count[chosen].min(),
             **{f"steps_{log.joints[j]}": count[j] for j in chosen},
         )  # fmt: skip
 
@@ -154,7 +147,7 @@ def _velocity_order(log: Log, alike: Array) -> Iterator[Finding]:
 def _unlike_velocity(log: Log, velocity: str) -> Iterator[Finding]:
     """Yield measured velocities that are not the derivatives of their positions at any delay."""
     severity = {"measured": "error", "auto": "warning"}.get(velocity, "note")
-    for joint, alike in unlike_velocities(log).items():
+    for joint, alike in units.unlike_velocities(log).items():
         yield finding(
             "velocity_mismatch", log.name, joint, subject=f"dq_{joint}", severity=severity,
             todo=velocity == "auto", correlation=alike,
@@ -163,14 +156,14 @@ def _unlike_velocity(log: Log, velocity: str) -> Iterator[Finding]:
 
 def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
     """Yield the delay of the measured velocity relative to the position, beyond the stated one."""
-    common, single = velocity_lags(log)
+    common, single = units.velocity_lags(log)
     lag, used = common - stated, single[single != 0.0] - stated
     scatter = float(np.median(np.abs(used - lag))) * 1.48 if len(used) else 0.0
     step = float(np.median(np.diff(log.t)))
     error = max(scatter / np.sqrt(max(len(used), 1)), 0.02 * step)
     if abs(lag) < max(_LAG, BEYOND_NOISE * error, 0.1 * step):
         return
-    is_delayed = abs(lag) >= LARGEST_LAG
+    is_delayed = abs(lag) >= units.LARGEST_LAG
     yield finding(
         "velocity_delay", log.name, severity="warning" if is_delayed else "note", todo=is_delayed,
         delay=lag, std_error=error, total=lag + stated,
@@ -298,16 +291,15 @@ def _rate(log: Log, step: Array, median: float) -> Iterator[Finding]:
 
 
 def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
-    gaps = np.flatnonzero(step > _GAP * median * (1 + 1e-6))
-    is_set = np.array([step[k] > _PAUSE and _goes_on(log.q, k) for k in gaps.tolist()], dtype=bool)
-    if is_set.any():
-        k = int(gaps[is_set][0])
-        jump, at = float(step[k]) - median, float(log.t[k])
-        yield finding("clock_step", log.name, jump=jump, at=at, steps=float(is_set.sum()))
-        gaps = gaps[~is_set]
-    if len(gaps) == 0:
+    every = np.flatnonzero(step > _GAP * median * (1 + 1e-6)).tolist()
+    jumps = [k for k in every if step[k] > _PAUSE and _goes_on(log.q, k)]
+    if jumps:
+        jump, at = step[jumps[0]] - median, log.t[jumps[0]]
+        yield finding("clock_step", log.name, jump=jump, at=at, steps=len(jumps))
+    gaps = [k for k in every if k not in jumps]
+    if not gaps:
         return
-    at = int(gaps[np.argmax(step[gaps])])
+    at = max(gaps, key=lambda k: step[k])
     longest, start = float(step[at]), float(log.t[at])
     severity = "warning" if longest > max(_LONG, _GAP * median) else "note"
     yield finding(
@@ -346,14 +338,14 @@ def _stale_rows(log: Log, step: Array) -> Iterator[Finding]:
     channels = np.hstack([x for x in (log.q, log.v, log.tau) if x is not None])
     same = (np.diff(channels, axis=0) == 0).all(axis=1)
     runs = _in_motion(log, runs_of(same))
-    stale = sum(stop - start for start, stop in runs)
-    if stale == 0:
+    if not runs:
         return
-    share, longest = stale / len(log.t), max(b - a for a, b in runs)
-    severity = "warning" if share > _STALE else "note"
+    lengths = [stop - start for start, stop in runs]
+    share = sum(lengths) / len(log.t)
     yield finding(
-        "stale_rows", log.name, severity=severity, rows=stale, share=share, longest_run=longest
-    )
+        "stale_rows", log.name, severity="warning" if share > _STALE else "note",
+        rows=sum(lengths), share=share, longest_run=max(lengths),
+    )  # fmt: skip
 
 
 def _in_motion(log: Log, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -368,7 +360,7 @@ def _in_motion(log: Log, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
     around += np.linalg.norm(q[np.minimum(last + 1 + m, last_row)] - q[last + 1], axis=1)
     moves = np.abs(change).max(axis=1, initial=0.0) > AT_REST * (t[last + 1] - t[first])
     if not log.has_torque:
-        steps = np.array([quantum(x) for x in q.T])
+        steps = np.array([units.quantum(x) for x in q.T])
         moves &= (np.abs(change) > 1.5 * steps).any(axis=1)
     continues = np.linalg.norm(change, axis=1) >= _CONTINUES * around * n / m
     rows = np.flatnonzero(moves & continues)
@@ -396,12 +388,12 @@ def _clipping(log: Log, joint: str, x: Array, moving: Array, *, moves: bool) -> 
         words = {"kind": kind, "cure": kind, "quoted": quoted(joint)}
         yield finding("constant_torque", log.name, joint, value=value, **words)
         return
-    step = quantum(x)
+    step = units.quantum(x)
     for limit in (float(x.max()), float(x.min())):
         at = (x == limit) & moving
         share = float(at.mean())
         plateau = max((stop - start for start, stop in runs_of(at)), default=0)
-        is_coarse = step > 0 and np.ptp(x) / step < COARSE
+        is_coarse = step > 0 and np.ptp(x) / step < units.COARSE
         if share >= _CLIPPED and plateau >= _PLATEAU and not is_coarse:
             yield finding("clipped", log.name, joint, limit=limit, share=share)
 

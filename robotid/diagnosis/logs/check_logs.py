@@ -17,14 +17,8 @@ from robotid.base.typing import Array
 from robotid.data.log import REPEATED, Log, Trajectory, repeated_share
 from robotid.data.signal_settings import LogUnits, SignalSettings
 from robotid.diagnosis.catalogue import finding
+from robotid.diagnosis.logs import channels
 from robotid.diagnosis.logs.base_checks import check_base
-from robotid.diagnosis.logs.channels import (
-    STILL,
-    check_channels,
-    check_clock,
-    check_rest,
-    check_torque_channels,
-)
 from robotid.diagnosis.logs.command_channels import check_commands
 from robotid.diagnosis.logs.hypotheses import Probe, smooth_motion, take_probe
 from robotid.diagnosis.logs.torque_checks import check_payload_change, check_torques, reductions_of
@@ -33,13 +27,7 @@ from robotid.diagnosis.urdf.inertials import assumed_inertials, explained_by_ass
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.factors import Reduction, compress, merge
 from robotid.dynamics.prepared_logs import base_problem, independent_share, row_mask
-from robotid.estimation.estimators import WLS, Estimate
-from robotid.estimation.estimators.determination import (
-    Determination,
-    base_spread,
-    determine,
-    is_poorly_excited,
-)
+from robotid.estimation.estimators import WLS, Estimate, determination
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread, with_assumed_inertials
 
@@ -94,12 +82,12 @@ def _examine_log(
     findings += [finding("log_note", name, text=note) for note in log.notes]
     findings += [finding("log_assumption", name, text=text) for text in log.assumed]
     if not model.is_static:  # rows of static poses may have gaps between them
-        findings += [*check_clock(log), *check_channels(log, signals)]
+        findings += [*channels.check_clock(log), *channels.check_channels(log, signals)]
     prismatic = [limit.name for limit in model.limits if limit.type == "prismatic"]
     findings += check_commands(log, prismatic)
     driven = [joint for joint in log.joints if joint not in model.passive]
     has_torque = log.has_torque and bool(driven)
-    sizes = list(check_torque_channels(log.select(driven))) if has_torque else []
+    sizes = list(channels.check_torque_channels(log.select(driven))) if has_torque else []
     findings += sizes
     if model.free_flyer or model.constraints or model.passive:
         findings.append(finding("floating_base", name))
@@ -112,7 +100,7 @@ def _examine_log(
     except DataError as error:
         findings.append(Finding(error.code, "error", name, str(error), log=name))
         return None, None
-    findings += check_rest(log, motion, model.layout)
+    findings += channels.check_rest(log, motion, model.layout)
     if not log.has_torque:
         return motion, None
     probe = take_probe(model, motion)
@@ -132,7 +120,7 @@ def check_excitation(
     model: RobotModel, mapping: BaseMapping, motions: Sequence[Trajectory],
     signals: SignalSettings, name: str,
 ) -> Iterator[Finding]:  # fmt: skip
-    """Yield which base parameters the fitted motions determine, by ``determine``."""
+    """Yield which base parameters the fitted motions determine."""
     prior, step = model.standard_parameters(), -(-max(len(m.t) for m in motions) // _ROWS)
     thinned = [motion.every(step) for motion in motions]
     try:
@@ -152,20 +140,18 @@ def check_excitation(
     squares = np.sum([motion.squares for motion in thinned], axis=0)
     spread = prior_spread(model, squares, sum(len(motion.t) for motion in thinned))
     rows = factors.weighted(wls.sigma / np.sqrt(share))[:, :-1]
-    known = determine(mapping.base_names, rows, base_spread(mapping.K, spread))
+    spread = determination.base_spread(mapping.K, spread)
+    known = determination.determine(mapping.base_names, rows, spread)
     yield excitation_finding(wls, known, name)
 
 
-def excitation_finding(wls: Estimate, known: Determination, name: str) -> Finding:
+def excitation_finding(wls: Estimate, known: determination.Determination, name: str) -> Finding:
     """Return the finding on which base parameters a motion determines."""
-    count = len(known.names)
-    evidence = {"rank": known.rank, "base": count, "weakest": known.shrinkage[-1]}
+    evidence = {"rank": known.rank, "base": len(known.names), "weakest": known.shrinkage[-1]}
     if np.isfinite(wls.condition):
         evidence["condition"] = wls.condition
-    is_poor = is_poorly_excited(wls, count)
-    todo = "poor" if is_poor else "lost"
-    if not known.groups:
-        todo = "weak" if is_poor else "good"
+    kinds = ("poor", "lost") if known.groups else ("weak", "good")
+    todo = kinds[not determination.is_poorly_excited(wls, len(known.names))]
     return finding(
         "excitation", name, severity="warning" if todo == "poor" else "note", what="rank",
         todo=todo, described=known.described() if known.groups else "",
@@ -182,9 +168,9 @@ def check_locked(
     for joint, q in positions.items():
         stated = model.locked[joint]
         middle, extent = float(np.median(q)), float(np.ptp(q))
-        if extent <= STILL and abs(middle - stated) <= STILL:
+        if extent <= channels.STILL and abs(middle - stated) <= channels.STILL:
             continue
-        what = "moves" if extent > STILL else "stands"
+        what = "moves" if extent > channels.STILL else "stands"
         yield finding(
             "locked_position", log, joint, what=what, todo=what, default=joint in asked,
             unit="m" if types[joint] == "prismatic" else "rad", stated=stated, median=middle,

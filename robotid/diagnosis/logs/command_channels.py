@@ -272,20 +272,20 @@ def _alike(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
 
 def _slow(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     """Yield the joints whose command is too slow to distinguish a delay from damping."""
-    names, ranges = list[str](), list[tuple[float, float]]()
-    fastest = 0.0
+    slow = []
     for loop in loops:
-        (f, _, _), (least, most), lag = loop.response, loop.delays, loop.lag[0]
-        width = most - least
-        is_determined = width <= _DETERMINED and (most < lag - 1e-3 or lag < _DETERMINED)
+        (least, most), lag = loop.delays, loop.lag[0]
+        is_narrow = most - least <= _DETERMINED
+        is_determined = is_narrow and (most < lag - 1e-3 or lag < _DETERMINED)
         if np.isnan(loop.bandwidth) and not is_determined:
-            names, ranges = [*names, loop.name], [*ranges, (least, most)]
-            fastest = max(fastest, float(f.max(initial=0.0)))
+            slow.append(loop)
+    fastest = max((float(loop.response[0].max(initial=0.0)) for loop in slow), default=0.0)
     if fastest > 0.0:
-        least, most = min(low for low, _ in ranges), max(high for _, high in ranges)
+        names = [loop.name for loop in slow]
+        shortest, longest = zip(*(loop.delays for loop in slow), strict=True)
         yield finding(
             "slow_command", log.name, _named(log, names), joint=listed(names),
-            frequency=fastest, shortest=least, longest=most,
+            frequency=fastest, shortest=min(shortest), longest=max(longest),
         )  # fmt: skip
 
 
@@ -297,12 +297,11 @@ def _small(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
         share = float(np.median(followed / swept)) if len(swept) >= _SWEEPS else 1.0
         evidence = {"sweep": sweep, "followed": share, "step": step}
         if share < (_FOLLOWED if loop.lag[0] > 0 else _STUCK):
-            dead = float(np.median(swept - followed))
+            what, dead = "suppressed", float(np.median(swept - followed))
             evidence |= {"sweep": float(np.median(swept)), "dead": dead, "wanted": 5 * dead}
-            what = "suppressed"
         elif sweep < _RESOLVED * step:
-            evidence |= {"count": sweep / step, "wanted": 5 * _RESOLVED * step}
             what = "steps"
+            evidence |= {"count": sweep / step, "wanted": 5 * _RESOLVED * step}
         else:
             continue
         yield finding("small_command", log.name, loop.name, what=what, unit=loop.unit, **evidence)
@@ -337,8 +336,8 @@ def _sampled(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     """Yield the joints whose log rate is too low for the bandwidth of their loops."""
     widths = {}
     for loop in loops:
-        f = loop.response[0]
-        width = loop.bandwidth if np.isfinite(loop.bandwidth) else float(f[-1]) if len(f) else 0.0
+        highest = float(loop.response[0].max(initial=0.0))
+        width = loop.bandwidth if np.isfinite(loop.bandwidth) else highest
         if width * loop.step * _RESOLVED > 1:
             widths[loop.name] = width
     if widths:

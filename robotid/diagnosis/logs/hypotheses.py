@@ -134,11 +134,8 @@ def smooth_motion(model: RobotModel, log: Log, settings: SignalSettings) -> Traj
 
 def take_probe(model: RobotModel, motion: Trajectory, *, samples: int = 500) -> Probe | None:
     """Return a probe of a motion, None if the motion is too small for any check."""
-    inner = np.ones(len(motion.t), dtype=bool)  # far from the ends of the segment
-    for number in np.unique(motion.segment):
-        part = motion.segment == number
-        t = motion.t[part]
-        inner[part] = (t >= t[0] + _MARGIN) & (t <= t[-1] - _MARGIN)
+    parts = np.split(motion.t, np.flatnonzero(np.diff(motion.segment)) + 1)
+    inner = np.concatenate([(t >= t[0] + _MARGIN) & (t <= t[-1] - _MARGIN) for t in parts])
     slow = AT_REST * model.layout.drive_speeds[: len(model.joints)]
     rows = np.flatnonzero((np.abs(motion.v) > slow).any(axis=1) & inner)
     if len(rows) < 50:

@@ -163,8 +163,8 @@ def _unexplained(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
     """Yield torques with a large unexplained share; one finding if these are most of them."""
     code, bad = "unexplained_torque", np.flatnonzero(share > _UNEXPLAINED)
     if 2 * len(bad) > len(share):
-        evidence = {"joints": len(bad), "of": len(share), "share": float(np.median(share))}
-        yield finding(code, name, what="robot", **evidence)
+        middle = float(np.median(share))
+        yield finding(code, name, what="robot", joints=len(bad), of=len(share), share=middle)
         return
     for j in bad:
         yield finding(code, name, probe.model.joints[j], what="joint", share=share[j])
@@ -221,9 +221,9 @@ def load_model(probe: Probe, share: Array, level: Array | None = None) -> LoadMo
     N, n = probe.tau.shape
     duration = float(np.ptp(probe.motion.t[probe.rows]))
     independent = min(_INDEPENDENT, _PER_SECOND * duration)
-    links, last = probe.loads(), probe.last_body
+    links = probe.loads()
     bodies = links.shape[2]
-    X = np.concatenate([links, last, probe.tau[:, :, None]], axis=2)
+    X = np.concatenate([links, probe.last_body, probe.tau[:, :, None]], axis=2)
     level = probe.tau.std(axis=0) if level is None else level
     used = (level > TINY * np.abs(probe.tau).max()) & (share < _UNEXPLAINED)
     R = np.zeros((n, bodies + 5, bodies + 5))
@@ -269,19 +269,16 @@ def _holds_no_gravity(probe: Probe) -> bool:
     # Both tests use the level of the logged torques, and no load on the last link.
     if not probe.gravity.any() or _holds_gravity(probe):
         return False
-    readings, ones = [(probe, own_share(probe)), compensated(probe)], np.ones(probe.tau.shape[1])
-    logged, corrected = (
-        load_model(reading, share, probe.tau.std(axis=0)).is_this_robot(ones)
-        for reading, share in readings
-    )
+    level, ones = probe.tau.std(axis=0), np.ones(probe.tau.shape[1])
+    readings = (probe, own_share(probe)), compensated(probe)
+    logged, corrected = (load_model(*x, level).is_this_robot(ones) for x in readings)
     return corrected and not logged
 
 
 def _holds_gravity(probe: Probe) -> bool:
     """Return whether the torque of a joint contains its gravity torque by the URDF."""
-    with_gravity, without = own_share(probe), own_share(probe, np.zeros(3))
-    followed = (with_gravity + FLOOR < _WRONG * (without + FLOOR)) & (without < 1.0)
-    return bool(followed.any())
+    share, without = own_share(probe), own_share(probe, np.zeros(3))
+    return bool(((share + FLOOR < _WRONG * (without + FLOOR)) & (without < 1.0)).any())
 
 
 def _error_of_links(theta: Array) -> float:

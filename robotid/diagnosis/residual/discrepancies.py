@@ -22,7 +22,7 @@ from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.residual.misfit import Misfit, find_misfits
 from robotid.diagnosis.residual.term_trials import Accepted, Sample, Trials, along
-from robotid.dynamics.prediction import body_slopes, drive_torque, inverse_dynamics
+from robotid.dynamics.torque import body_slopes, drive_torque, inverse_dynamics
 from robotid.estimation.fitting.fitted import Fit
 from robotid.robot.model import RobotModel
 
@@ -167,12 +167,10 @@ def explain_residual(
 
 def _columns(misfits: Sequence[Misfit], sample: Sample) -> Array:
     """Return the columns of terms that drive models lack, shape (N, n, c)."""
-    columns = []
-    for misfit in misfits:
-        j = sample.joints.index(misfit.joint)
-        of_joint = misfit.term.columns(sample.motions[j])  # (N, k)
-        columns.append(np.eye(len(sample.joints))[j][:, None] * of_joint[:, None])
-    return np.concatenate(columns, axis=2)
+    places = [(m.term, sample.joints.index(m.joint)) for m in misfits]
+    columns = [(term.columns(sample.motions[j]), j) for term, j in places]  # (N, k) each
+    one = np.eye(len(sample.joints))
+    return np.concatenate([one[j][:, None] * of_joint[:, None] for of_joint, j in columns], axis=2)
 
 
 def _left(sample: Sample, Z: Array) -> float:

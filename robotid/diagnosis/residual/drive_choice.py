@@ -23,7 +23,7 @@ from robotid.base.typing import Array
 from robotid.diagnosis import decisions
 from robotid.diagnosis.decisions import Round, select
 from robotid.diagnosis.residual.term_trials import Sample, Trial, Trials, take_sample
-from robotid.dynamics.prediction import drive_motion_along
+from robotid.dynamics.torque import drive_motion_along
 from robotid.estimation.fitting.drive_terms import DriveChoice, FoundShape, Tried, with_shapes
 from robotid.estimation.fitting.fitted import Solution
 from robotid.robot.drive_term import DataRange, DriveMotion, DriveTerm, Family, MemorylessTerm
@@ -271,10 +271,8 @@ def _conditioned(
     first = refined(best)
     if not any(first.faults):
         return first
-    by_family: dict[str, int] = {}
     left, whole = this.left, float(this.before.sum())
-    for i in sorted(left, key=lambda i: float(left[i].sum())):
-        by_family.setdefault(every.name(i), i)
+    by_family = _of_families(every, left)
     by_family.pop(every.name(best))
     others = [refined(i) for i in by_family.values() if left[i].sum() < whole]
     better = [other for other in others if other.faults < first.faults]
@@ -294,16 +292,20 @@ def _considered(
     every: _Options, this: Round[int], torque: float, chosen: Sequence[int], best: int | None
 ) -> list[Tried]:
     """Return the error that each family would give at its best shape, or as selected."""
-    by_family: dict[str, int] = {}
-    for i, after in this.left.items():
-        before = by_family.setdefault(every.name(i), i)
-        if i == best or (before != best and after.sum() <= this.left[before].sum()):
-            by_family[every.name(i)] = i
-    names = [every.name(k) for k in chosen]
+    names, by_family = [every.name(k) for k in chosen], _of_families(every, this.left, best)
     return [
         Tried((*names, name), _percent(this.left[i], torque), this.p_value(i), i == best)
-        for name, i in by_family.items()
+        for name in dict.fromkeys(every.name(i) for i in this.left)
+        for i in [by_family[name]]
     ]
+
+
+def _of_families(
+    every: _Options, left: Mapping[int, Array], selected: int | None = None
+) -> dict[str, int]:
+    """Return of each family the selected candidate, or that with the smallest residual."""
+    best_last = sorted(left, key=lambda i: (i == selected, -float(left[i].sum())))
+    return {every.name(i): i for i in best_last}
 
 
 def _percent(left: Array, torque: float) -> float:

@@ -327,8 +327,8 @@ def _advice(term: Candidate, setting: str) -> str:
         return term.advice
     table, *lines = setting.split("\n")
     if term.coupled:
-        size = "with the second ratio from the data sheet"
-        return f"Add {table} to the job: {' and '.join(lines)}, {size}"
+        added = f"Add {table} to the job: {' and '.join(lines)}"
+        return f"{added}, with the second ratio from the data sheet"
     added = f"add it to the model with {lines[0]} in {table}"
     return f"{term.advice}, or {added}" if term.advice else f"{added[0].upper()}{added[1:]}"
 

@@ -19,7 +19,7 @@ from robotid.base.typing import Array
 from robotid.diagnosis.decisions import GROWN, ROUNDING, STEP, TINY
 from robotid.diagnosis.residual.misfit import Misfit
 from robotid.diagnosis.residual.term_trials import RIDGE, Sample, Trial, Trials, take_sample
-from robotid.dynamics.prediction import drive_motion_along
+from robotid.dynamics.torque import drive_motion_along
 from robotid.estimation.fitting.drive_terms import DriveChoice, JointMotion, OpenTerm
 from robotid.estimation.fitting.fitted import Fit, Solution
 from robotid.robot.drive_term import DriveMotion, DriveTerm

@@ -19,9 +19,9 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import sentence_of
-from robotid.dynamics.prediction import predict, rigid_parts
 from robotid.dynamics.prepared_logs import independent_share
 from robotid.dynamics.rows import drive_values, friction_directions
+from robotid.dynamics.torque import predict, rigid_parts
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.fitted import Fit
 from robotid.robot.model import RobotModel
@@ -54,11 +54,9 @@ class TorqueSplit:
     def terms_of(self, row: int) -> dict[str, dict[str, Array]]:
         """Return the torque (N,) of each drive parameter in a row, by part and name."""
         terms: dict[str, dict[str, Array]] = {}
-        for name, kind, ratio, torque in zip(
-            self.names, self.kinds, self.loads[row], self.terms, strict=True
-        ):
-            if ratio:
-                terms.setdefault(kind, {})[name] = ratio * torque
+        for k in np.flatnonzero(self.loads[row]):
+            of_kind = terms.setdefault(self.kinds[k], {})
+            of_kind[self.names[k]] = self.loads[row, k] * self.terms[k]
         return terms
 
 
@@ -196,11 +194,9 @@ class JointTorque:
     def cause(self) -> tuple[str, str]:
         """The cause of the residual, and what to do."""
         rms, best = self.rms, self._best(self.follows)
-        name, where, slow = "", 0.0, False
-        if best is not None:
-            name, where = best.name, best.where
-        if name == "speed":
-            slow = abs(where) < _SLOW * self.size(self.quantities["speed"][1])
+        name, where = ("", 0.0) if best is None else (best.name, best.where)
+        is_speed = name == "speed"
+        slow = is_speed and abs(where) < _SLOW * self.size(self.quantities["speed"][1])
         quick = self.broadband or 0.0
         kinds = {
             "unused": bool(np.isnan(rms["measured"])),

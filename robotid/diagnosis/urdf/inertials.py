@@ -12,8 +12,7 @@ from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import AGREES, ROUNDING
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
-from robotid.robot.bodies import link_places
-from robotid.robot.geometry import body_points, kinematic_lengths
+from robotid.robot.bodies import body_points, kinematic_lengths, link_places
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.prior import REASONS, assumed_masses

@@ -71,7 +71,7 @@ class Inspection:
             "robot": self.robot,
             "joints": list(self.joints),
             "structure": structure
-            and vars(structure) | {"undetermined": list(structure.undetermined)},
+            and vars(structure) | {"undetermined": [*structure.undetermined]},
             "base_groups": list(self.base_groups),
             "findings": [_plain(one) for one in self.findings],
         }
@@ -222,7 +222,7 @@ def _link_findings(model: RobotModel) -> Iterator[Finding]:
 
 def _plain(one: Finding) -> Mapping[str, Any]:
     kind, name = one.where.split(" ", 1)
-    place = {} if kind == "file" else {kind: name}
-    evidence = {key: float(value) for key, value in one.evidence.items()}
-    plain = {"code": one.code, "severity": one.severity, **place, "message": one.message}
-    return {**plain, "evidence": evidence}
+    return {
+        "code": one.code, "severity": one.severity, **({} if kind == "file" else {kind: name}),
+        "message": one.message, "evidence": {key: float(x) for key, x in one.evidence.items()},
+    }  # fmt: skip

@@ -22,8 +22,14 @@ from robotid.estimation.fitting.estimator_settings import BoundedSettings, Consi
 from robotid.estimation.fitting.fitted import Fit
 from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.estimation.variation.variation import UnlikeRun, Variation
-from robotid.robot.bodies import density_share, held_parameters, least_density, negligible_bodies
-from robotid.robot.geometry import body_boxes, body_points
+from robotid.robot.bodies import (
+    body_boxes,
+    body_points,
+    density_share,
+    held_parameters,
+    least_density,
+    negligible_bodies,
+)
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
@@ -342,7 +348,7 @@ def _cure(fit: Fit, body: str, excess: float = 0.0) -> str:
     """Return what to correct for an impossible body."""
     cure = "Record motion about more axes, or pin it to the URDF"
     for stated, mass in _stated_of(fit, body).items():
-        limit = f" (possible: up to about {mass - excess:.3g} kg)" if excess > 0 else ""
+        limit = f" (possible: up to about {mass - excess:.3g} kg)" * (excess > 0)
         cure = f"Check the stated {stated} of {mass:.4g} kg{limit}: weigh it, or remove it"
     return cure
 
@@ -366,10 +372,10 @@ def _of_outliers(fit: Fit) -> Finding:
         f"{o.predicted:.4g}, residual {o.size:.0f} times the typical one"
         for o in outliers[:NAMED]
     ) + f"; and {more} more" * (more > 0)
-    count = f"{len(outliers)} outlier{'s' if len(outliers) > 1 else ''}"
     return finding(
-        "outliers", "", outliers[0].joint, count=count, where=places,
-        cure=fit.estimator.is_robust, places=len(outliers), largest=outliers[0].size,
+        "outliers", "", outliers[0].joint, where=places, cure=fit.estimator.is_robust,
+        count=f"{len(outliers)} outlier{'s' * (len(outliers) > 1)}", places=len(outliers),
+        largest=outliers[0].size,
     )  # fmt: skip
 
 

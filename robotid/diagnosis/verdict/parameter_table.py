@@ -78,12 +78,10 @@ def correlated_parameters(fit: Identified) -> dict[int, tuple[int, float]]:
     """Return drive parameters strongly correlated with another parameter of the same drive."""
     layout, C, at_bound = fit.model.layout, fit.standard_covariance, fit.at_bound
     pairs = {}
+    drive_of = enumerate([d for d, _ in layout.drive_parameters], start=layout.n_inertial)
+    used = [(k, drive) for k, drive in drive_of if C[k, k] > 0 and not at_bound[k]]
     for drive in range(len(layout.drives)):
-        own = [
-            k
-            for k, (d, _) in enumerate(layout.drive_parameters, start=layout.n_inertial)
-            if d == drive and C[k, k] > 0 and not at_bound[k]
-        ]
+        own = [k for k, of_drive in used if of_drive == drive]
         for i, row in zip(own, _correlations(C, own), strict=True):
             k = int(np.argmax(np.abs(row)))
             if abs(row[k]) > CORRELATED:

@@ -15,8 +15,7 @@ from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import sentence_of
 from robotid.diagnosis.decisions import AGREES, DIFFERS, TINY
 from robotid.dynamics.constraint_rows import loop_basis, without_forces
-from robotid.dynamics.prediction import predict
-from robotid.dynamics.torque import joint_torque_regressor
+from robotid.dynamics.torque import joint_torque_regressor, predict
 from robotid.estimation.fitting.fitted import Fit
 from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.robot.parameters import pseudo_inertia
@@ -422,8 +421,7 @@ def stated_mass(fit: Fit) -> StatedMass | None:
     # A range wider than +- 5 % is a bound, not a statement. So is the mass of a pinned link.
     layout, bounds = fit.model.layout, fit.estimator.bounds
     stated = {f"mass of {link}": (link, pair) for link, pair in bounds.masses.items()}
-    if bounds.total is not None:
-        stated["total_mass"] = ("", bounds.total)
+    stated |= {} if bounds.total is None else {"total_mass": ("", bounds.total)}
     names, rows, widths = [], [], []
     for name, (link, (low, high)) in stated.items():
         centre, width = 0.5 * (low + high), 0.5 * (high - low)

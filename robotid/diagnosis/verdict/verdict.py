@@ -194,12 +194,9 @@ def error_of(measured: JointMetrics) -> float:
 
 
 def _judge_joint(
-    evidence: JointEvidence,
-    joint: str,
-    log: str,
-    measured: JointMetrics,
+    evidence: JointEvidence, joint: str, log: str, measured: JointMetrics,
     fitted: JointMetrics | None,
-) -> None:
+) -> None:  # fmt: skip
     """Add the first reason that one log gives: rank 0 is worse than a constant, 1 than the URDF."""
     error, urdf = error_of(measured), measured.baselines.get("urdf")
     urdf = np.inf if urdf is None else urdf
@@ -230,13 +227,9 @@ def _judge_joint(
 
 
 def uses_of_torques(
-    joints: Mapping[str, str],
-    *,
-    is_consistent: bool,
-    is_static: bool,
-    log_errors: Sequence[str],
+    joints: Mapping[str, str], *, is_consistent: bool, is_static: bool, log_errors: Sequence[str],
     scale_check: ScaleCheck | None,
-) -> dict[str, str]:
+) -> dict[str, str]:  # fmt: skip
     """Return what a result with predicted torques can be used for: "yes" or "no", and why."""
     # Inertials need consistency and the scale; a payload joints that gravity loads, and the scale.
     predicted, gravity = _predicted(joints), () if scale_check is None else scale_check.gravity
@@ -281,17 +274,16 @@ def uses_line(uses: Mapping[str, str]) -> str:
 
 def _predicted(joints: Mapping[str, str]) -> str:
     """Return whether the predictions of joints can be used."""
-    tested = {joint: status for joint, status in joints.items() if status != "not evaluated"}
-    if not tested:
+    statuses = set(joints.values())
+    if statuses <= {"not evaluated"}:
         return _NOT_VERIFIED
-    poor = [joint for joint, status in tested.items() if status == "poor"]
-    if len(poor) == len(tested):
+    if statuses <= {"not evaluated", "poor"}:
         return "no, the errors on validation logs are large"
-    if poor:
+    if "poor" in statuses:
         return f"yes, without {_named(joints, 'poor')}"
-    if len(tested) < len(joints):
+    if "not evaluated" in statuses:
         return f"yes, without {_named(joints, 'not evaluated')} (not evaluated)"
-    return "yes, with the warnings" if "usable" in tested.values() else "yes"
+    return "yes, with the warnings" if "usable" in statuses else "yes"
 
 
 def _named(joints: Mapping[str, str], status: str) -> str:
@@ -349,14 +341,10 @@ class Verdict:
 
 
 def judge(
-    predictions: Predictions,
-    determined: Determined,
-    *,
-    log_errors: Sequence[str] = (),
-    warnings: Sequence[VerdictWarning] = (),
-    scale_check: ScaleCheck | None = None,
+    predictions: Predictions, determined: Determined, *, log_errors: Sequence[str] = (),
+    warnings: Sequence[VerdictWarning] = (), scale_check: ScaleCheck | None = None,
     cause_of: Callable[[str], tuple[str, str]] | None = None,
-) -> Verdict:
+) -> Verdict:  # fmt: skip
     """Return the verdict on a result."""
     evidence, hidden = predictions.on_each(), predictions.hidden
     costly = [w for w in warnings if w.effect == "poor" and w.joint in evidence]
@@ -409,12 +397,10 @@ def judge(
         per_joint, poor=poor, warnings=reasons, good=good, notes=notes, log_errors=log_errors
     )
     uses = uses_of_torques(
-        {joint: per_joint[joint].status for joint in evidence},
-        is_consistent=determined.is_consistent,
-        is_static=determined.is_static,
+        {joint: per_joint[joint].status for joint in evidence}, scale_check=scale_check,
+        is_consistent=determined.is_consistent, is_static=determined.is_static,
         log_errors=log_errors,
-        scale_check=scale_check,
-    )
+    )  # fmt: skip
     return replace(verdict, warnings=tuple(stated), use_for=uses)
 
 
@@ -424,10 +410,9 @@ def _ranked(reasons: Iterable[tuple[int, str]]) -> list[str]:
 
 
 def _largest_error(
-    per_joint: dict[str, JointVerdict],
-    evidence: Mapping[str, JointEvidence],
+    per_joint: dict[str, JointVerdict], evidence: Mapping[str, JointEvidence],
     cause_of: Callable[[str], tuple[str, str]],
-) -> list[str]:
+) -> list[str]:  # fmt: skip
     """Add the cause to the good joint with the largest error; return it if all joints are good."""
     good = [joint for joint, verdict in per_joint.items() if verdict.status == "good"]
     if not good:
@@ -436,20 +421,13 @@ def _largest_error(
     cause, advice = cause_of(last)
     text = f"largest error of the good joints: {'. '.join(filter(None, (cause, advice)))}"
     per_joint[last] = replace(per_joint[last], reasons=(*per_joint[last].reasons, text))
-    is_all = len(good) == len(per_joint)
-    return [f"{last}: largest error: {cause}"] if is_all else []
+    return [f"{last}: largest error: {cause}"] if len(good) == len(per_joint) else []
 
 
 def concluded(
-    joints: Mapping[str, JointVerdict],
-    *,
-    poor: Sequence[str],
-    warnings: Sequence[str],
-    good: str,
-    notes: Sequence[str] = (),
-    log_errors: Sequence[str] = (),
-    is_tested: bool = True,
-) -> Verdict:
+    joints: Mapping[str, JointVerdict], *, poor: Sequence[str], warnings: Sequence[str], good: str,
+    notes: Sequence[str] = (), log_errors: Sequence[str] = (), is_tested: bool = True,
+) -> Verdict:  # fmt: skip
     """Return the verdict that follows from reasons."""
     status = "usable" if warnings else "good"
     status = "poor" if poor or log_errors else status if is_tested else "not evaluated"
@@ -525,19 +503,14 @@ def rejected(
 
 
 def warnings_of(
-    findings: Sequence[Finding],
-    joints: Sequence[str],
-    validation: Sequence[str] = (),
-    *,
+    findings: Sequence[Finding], joints: Sequence[str], validation: Sequence[str] = (), *,
     is_robust: bool = False,
-) -> tuple[VerdictWarning, ...]:
+) -> tuple[VerdictWarning, ...]:  # fmt: skip
     """Return the warnings of a verdict that follow from findings, each once."""
     jumps = {(f.log, f.joints) for f in findings if is_robust and is_downweighted(f)}
     warnings: list[VerdictWarning] = []
-    for one in findings:
-        is_known = one.code in codes_with("verdict")
-        if one.severity != "warning" or not is_known or one.code == "repeated_motion":
-            continue
+    known = {*codes_with("verdict")} - {"repeated_motion"}
+    for one in (one for one in findings if one.severity == "warning" and one.code in known):
         # the unexplained torque is the spikes, which a robust fit downweights
         is_jump = one.code == "unexplained_torque" and (one.log, one.joints) in jumps
         if not is_jump and not _is_harmless(one):
@@ -587,17 +560,10 @@ def _is_harmless(finding: Finding) -> bool:
 
 
 def judge_positions(
-    metrics: Metrics,
-    joints: Sequence[str],
-    *,
-    fitted: Metrics | None = None,
-    is_validation: bool,
-    is_settled: bool = True,
-    log_errors: Sequence[str] = (),
-    cautions: Sequence[str] = (),
-    scale: str = "",
-    knows_torques: bool = False,
-) -> Verdict:
+    metrics: Metrics, joints: Sequence[str], *, is_validation: bool, fitted: Metrics | None = None,
+    is_settled: bool = True, log_errors: Sequence[str] = (), cautions: Sequence[str] = (),
+    scale: str = "", knows_torques: bool = False,
+) -> Verdict:  # fmt: skip
     """Return the verdict on simulated positions."""
     measured, of_fit = metrics.per_joint, {} if fitted is None else fitted.per_joint
     verdicts = {
@@ -610,17 +576,16 @@ def judge_positions(
     unseen = "prediction of unseen motion not evaluated: no validation log given"
     warnings = [*cautions, *([] if is_validation else [unseen])]
     warnings += [] if is_settled else ["the fit has not converged"]
-    verdict = concluded(
-        verdicts,
-        poor=reasons["poor"],
-        warnings=[*warnings, *reasons["not evaluated"], *reasons["usable"]],
-        good="simulated position error on validation logs: at most "
+    good = (
+        f"simulated position error on validation logs: at most "
         f"{max(errors.values(), default=0.0):.2g} % of each joint's RMS motion, smaller than those "
-        "of simpler models",
-        notes=[scale] if scale else [],
-        log_errors=log_errors,
-        is_tested=is_validation and bool(measured),
+        "of simpler models"
     )
+    verdict = concluded(
+        verdicts, poor=reasons["poor"], good=good, notes=[scale] if scale else [],
+        warnings=[*warnings, *reasons["not evaluated"], *reasons["usable"]],
+        log_errors=log_errors, is_tested=is_validation and bool(measured),
+    )  # fmt: skip
     status = {joint: verdict.status for joint, verdict in verdicts.items() if joint in measured}
     uses = uses_of_motion(status, log_errors=log_errors, is_scaled=knows_torques)
     return replace(verdict, use_for=uses)

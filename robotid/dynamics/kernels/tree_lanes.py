@@ -11,9 +11,9 @@ With a displacement d q_i of joint i, a motion m in the frame of its body change
 Common arguments of the kernels:
 
 - work: The work space.
-- tree: The bodies and their joints; see ``compiled.Tree``.
+- tree: The bodies and their joints; see ``rows.Tree``.
 - own, up: First entries of a body and of its parent.
-- joint: Constants of a joint; see ``compiled.joint_constants``.
+- joint: Constants of a joint; see ``rows.joint_constants``.
 - bodies: Ten inertial parameters of each joint's body, shape (n, 10).
 - v, a: First entries of the speeds and accelerations of the joints.
 

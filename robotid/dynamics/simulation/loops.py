@@ -18,8 +18,8 @@ from robotid.base.exceptions import NotConvergedError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.data.log import Log
-from robotid.dynamics.compiled import Tree, flatten, why_not
 from robotid.dynamics.factors import in_order
+from robotid.dynamics.rows import Tree, flatten, why_not
 from robotid.robot.drive_term import BRISTLES, DIRECTED, DriveTerm, MemorylessTerm
 from robotid.robot.drives import Bristles
 from robotid.robot.mass_matrix import rigid_mass_matrices
@@ -185,11 +185,6 @@ class ClosedLoopRobot:
             raise SettingsError(f"{model.name} cannot be simulated: {why}")
         self.model, self.step, self.corrects = model, step, corrects
         self._parts = _parts(flatten(model))
-
-    @property
-    def parts(self) -> tuple[Array, ...]:
-        """The joints of each independent part."""
-        return tuple(part.joints for part in self._parts)
 
     @property
     def joint_of_body(self) -> tuple[int, ...]:

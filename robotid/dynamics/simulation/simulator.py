@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pinocchio as pin
 
-from robotid.base.exceptions import DataError, NotConvergedError, SettingsError
+from robotid.base.exceptions import DataError, ModelError, NotConvergedError, SettingsError
+from robotid.base.findings import listed, suggestion
 from robotid.base.typing import Array, ProgressCallback, ignore_progress
 from robotid.data.log import Log, Trajectory
-from robotid.dynamics.prediction import predict, remember
 from robotid.dynamics.simulation.motions import Motion
 from robotid.dynamics.simulation.simulation_settings import (
     Actuator,
@@ -20,14 +20,16 @@ from robotid.dynamics.simulation.simulation_settings import (
     PerJoint,
     Sensors,
     Simulation,
+    Truth,
     by_joint,
 )
+from robotid.dynamics.torque import predict, remember
 from robotid.robot.bodies import link_transfer
 from robotid.robot.drive_term import DriveTerm, MemorylessTerm
 from robotid.robot.drives import Bristles, Lag
 from robotid.robot.mass_matrix import drive_inertia, rigid_mass_matrices
 from robotid.robot.model import RobotModel
-from robotid.robot.parameters import pseudo_inertia
+from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 
 _LONGEST_STEP = 2.5e-3  # largest step of the integration, at any rate of the log [s]
 _ELASTIC_STEP = 0.3  # largest step, relative to 1 / w of the fastest elastic gear
@@ -40,8 +42,11 @@ _LEAST_INERTIA = 0.02  # smallest inertia in the computation of PD gains [kg m^2
 _ITERATIONS = 200  # of the fixed point of load and load-dependent friction
 _SETTLED = 1e-12  # relative change of the load at convergence
 _SIGN_SPEED = 2e-4  # speed over which the plant's Coulomb friction reverses [rad/s or m/s]
+_TYPICAL_EFFORT = 50.0  # effort limit of a drive with typical parameters [N m or N]
+_IMPOSSIBLE = -1e-9  # smallest eigenvalue of a body's pseudo-inertia over the largest
 
-# ROS34PW2, a Rosenbrock W-method: order 3 for any Jacobian approximation, L-stable
+# ROS34PW2, a Rosenbrock W-method: order 3 for any Jacobian approximation, L-stable, stable with
+# stiction (Rang, Angermann 2005, New Rosenbrock W-methods)
 _GAMMA = 4.3586652150845900e-01
 _ALPHA = np.zeros((4, 4))
 _ALPHA[1, 0] = 8.7173304301691801e-01
@@ -96,11 +101,7 @@ def follow(
     settings: Simulation,
     progress: ProgressCallback = ignore_progress,
 ) -> Run:
-    """Return the exact motion of a robot, a ``RobotPlant``, that tracks a motion.
-
-    With elastic gears, rotor and friction are on the motor's side. The Rosenbrock W-method of order
-    3 is stable with stiction (Rang, Angermann 2005, New Rosenbrock W-methods).
-    """
+    """Return the exact motion of a plant that tracks a motion; friction is on the motor's side."""
     _check_size(duration * rate, 1)
     t = np.arange(round(duration * rate) + 1) / rate
     loaded = carried(model, pi, settings.payload)
@@ -243,9 +244,8 @@ class Friction:
 class RobotPlant:
     """The plant M(q) a + b(q, v) + Ia a + Fv v + Fc sign(v) + off = u of a robot.
 
-    The drives have the terms of the model; sign(v) is tanh(v / 0.2 mm/s). Load-dependent friction
-    uses the load of the same instant. The bristle deflection z is a state with ``bristle_rate``; if
-    it is not given, sliding is steady. A ``Lag`` is one of the measurement. q, v, u (n,), pi (p,).
+    sign(v) is tanh(v / 0.2 mm/s). Load-dependent friction uses the load of the same instant. The
+    bristle deflection z is a state; not given: steady. A ``Lag`` is one of the measurement.
     """
 
     def __init__(self, model: RobotModel, pi: Array) -> None:
@@ -403,13 +403,12 @@ class _Loop:
         self.controller = _Torque(model, settings.controller, mass)
         share = settings.actuator.effort or 0.0
         urdf = [share * max(joint.effort, 0.0) or np.inf for joint in model.limits]
-        limits = by_joint(settings.actuator.limits, model.joints, "actuator: limits", np.nan)
-        self.limit = np.where(np.isnan(limits), urdf, limits)  # [N m or N]
+        stated = settings.actuator.limits
+        self.limit = by_joint(stated, model.joints, "actuator: limits", urdf)  # [N m or N]
         self.has_limits, self.n = bool(np.isfinite(self.limit).any()), len(model.joints)
         self.is_at_motor = settings.sensors.side == "motor"
-        self.gear = (
-            _Gear(plant, settings.actuator) if settings.actuator.stiffness is not None else None
-        )
+        actuator = settings.actuator
+        self.gear = None if actuator.stiffness is None else _Gear(plant, actuator)
         self.longest_step = self._longest_step()
 
     def start(self, q: Array, v: Array, a: Array) -> Array:
@@ -564,14 +563,9 @@ class _Torque:
         self.kind, self.w = settings.kind, settings.bandwidth
         self.nominal = RobotPlant(model, model.standard_parameters())
         inertia = np.maximum(mass.diagonal(), _LEAST_INERTIA)
-        stated = [
-            by_joint(x, model.joints, f"controller: {name}", np.nan)
-            for name, x in (("kp", settings.kp), ("kd", settings.kd))
-        ]
         default = inertia * self.w**2, 2 * inertia * self.w
-        self.kp, self.kd = (
-            np.where(np.isnan(x), y, x) for x, y in zip(stated, default, strict=True)
-        )
+        self.kp = by_joint(settings.kp, model.joints, "controller: kp", default[0])
+        self.kd = by_joint(settings.kd, model.joints, "controller: kd", default[1])
 
     def feedforward(self, q: Array, v: Array, a: Array) -> Array:
         """Return the feed-forward torque along a motion, shape (N, n)."""
@@ -650,3 +644,89 @@ def _rounded(values: Array, step: Array) -> Array:
     """Return values rounded to steps, for the joints that have one."""
     size = np.where(step > 0, step, 1.0)
     return np.where(step > 0, np.round(values / size) * size, values)
+
+
+def draw_parameters(model: RobotModel, settings: Truth, rng: np.random.Generator) -> Array:
+    """Return the true standard parameters of a robot near the model, shape (p,)."""
+    layout = model.layout
+    pi = model.standard_parameters()
+    pi[: layout.n_inertial] = perturbed_bodies(model, settings.inertials, rng)
+    has_drives = settings.drives == "usual"
+    effort = {joint.name: joint.effort for joint in model.limits}
+    for i, (d, term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
+        drawn = rng.uniform(*term.typical)
+        shares = [x / _TYPICAL_EFFORT for j, _ in layout.drives[d].ratios if (x := effort[j]) > 0]
+        is_share = isinstance(term, MemorylessTerm) and term.is_loaded
+        size = 1.0 if is_share or term.is_measured else min([1.0, *shares])
+        pi[i] = has_drives * size * drawn
+    for name, value in settings.values.items():
+        if name not in layout.names:
+            raise SettingsError(
+                f"truth: values: {name!r} is not a parameter of {model.name}"
+                f"{suggestion(name, layout.names)} Known: {listed(layout.names, 12)}"
+            )
+        pi[layout.names.index(name)] = value
+    _check(model, pi)
+    return pi
+
+
+def perturbed_bodies(model: RobotModel, size: float, rng: np.random.Generator) -> Array:
+    """Return inertial parameters of bodies near the model's, shape (10 bodies,).
+
+    J' = J^1/2 exp(S) J^1/2 of each body; S is symmetric, with ten independent normal coordinates in
+    the metric d^2 = 1/2 tr(log(J^-1 J')^2) (Wensing, Kim, Slotine 2018; Lee, Park 2018, (13)).
+    """
+    bodies = model.standard_parameters()[: model.layout.n_inertial]
+    if size == 0.0:
+        return bodies
+    perturbed = []
+    for name, J in zip(model.layout.bodies, pseudo_inertia(bodies), strict=True):
+        values, axes = np.linalg.eigh(J)
+        if values[0] < _IMPOSSIBLE * max(values[-1], 0.0) or values[-1] < 0:
+            raise ModelError(
+                f"body {name!r} of the URDF is physically inconsistent: the smallest eigenvalue of "
+                f"its pseudo-inertia is {values[0]:.3g}, wanted 0 or more. Correct its inertial "
+                "(robotid inspect), or state inertials = 0 in [truth]"
+            )
+        root = axes * np.sqrt(np.maximum(values, 0.0)) @ axes.T
+        S = np.zeros((4, 4))
+        S[np.triu_indices(4, 1)] = rng.standard_normal(6)
+        S = S + S.T + np.diag(np.sqrt(2.0) * rng.standard_normal(4))  # 1/2 tr(S^2): ten squares
+        values, axes = np.linalg.eigh(size * S)
+        factor = axes * np.exp(values) @ axes.T  # exp(size S)
+        perturbed.append(inertial_from_pseudo_inertia(root @ factor @ root))
+    return np.concatenate(perturbed)
+
+
+def another_robot(model: RobotModel, rng: np.random.Generator) -> Array:
+    """Return parameters (p,) of a robot with other masses (10 to 30 %), a tool, and friction."""
+    size = model.layout.n_inertial
+    pi = model.standard_parameters()
+    by_body = pi[:size].reshape(-1, 10)
+    change = rng.uniform(0.1, 0.3, len(by_body)) * rng.choice([-1, 1], len(by_body))
+    by_body *= 1 + change[:, None]
+    mass, arm = 1.2, 0.1  # [kg], [m]
+    tool = [mass, 0.0, mass * arm, 0.0, mass * arm**2, 0.0, 0.0, 0.0, 0.0, mass * arm**2]
+    by_body[-1] += tool
+    by_body[-1] += [0, 0, 0, 0, 1e-3, 0, 1e-3, 0, 0, 1e-3]  # a tool has an extent
+    for i, (_, term) in enumerate(model.layout.drive_parameters, start=size):
+        pi[i] = rng.uniform(*term.typical)
+    return pi
+
+
+def _check(model: RobotModel, pi: Array) -> None:
+    """Refuse physically inconsistent parameters of bodies and drives."""
+    layout = model.layout
+    bodies = pseudo_inertia(pi[: layout.n_inertial])
+    for name, J in zip(layout.bodies, bodies, strict=True):
+        values = np.linalg.eigvalsh(J)
+        if values[0] < _IMPOSSIBLE * max(values[-1], 0.0):
+            raise SettingsError(
+                f"truth: body {name!r} is physically inconsistent: the smallest eigenvalue of its "
+                f"pseudo-inertia is {values[0]:.3g}, wanted 0 or more. State other values, or "
+                "inertials = 0.1 to draw consistent ones"
+            )
+    for i in np.flatnonzero(layout.is_nonnegative() & (pi < 0)):
+        raise SettingsError(
+            f"truth: {layout.names[i]} is {pi[i]:g} {layout.units[i]}, wanted 0 or more"
+        )

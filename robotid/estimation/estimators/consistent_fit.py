@@ -257,17 +257,15 @@ class Consistent(BatchEstimator):
     def _minimised(self, rows: Array, base: Estimate) -> Estimate:
         """Return the minimum of rows (k, b + 1), from an estimate of the base parameters."""
         minimum = self.programme.minimise(rows, self.prior_weight)
+        known = self.layout.owned_by(self.constraints.pinned)
+        spread = base_spread(self.K, self.prior_std, known)
         return replace(
-            base,
-            theta=minimum.x,
+            base, theta=minimum.x, names=self.layout.names, message=minimum.message,
             covariance=self.programme.covariance(self.prior_weight, rows, minimum.x),
-            names=self.layout.names,
-            undetermined=self._undetermined(rows, base.names),
-            n_iter=base.n_iter + minimum.n_iter,
-            message=minimum.message,
-            prior_std=self.spread_before,
+            undetermined=determine(base.names, rows[:, :-1], spread).undetermined,
+            n_iter=base.n_iter + minimum.n_iter, prior_std=self.spread_before,
             details=self._details(minimum.x),
-        )
+        )  # fmt: skip
 
     def noise(self, factors: Factors) -> Array:
         """Return the noise levels of weighted least squares without a prior, shape (n,) [N m or N].
@@ -316,12 +314,6 @@ class Consistent(BatchEstimator):
     def _held(self) -> Array:
         """The known part of each body, shape (10 bodies,); 0 without one."""
         return np.zeros(self.layout.n_inertial) if self.held is None else self.held
-
-    def _undetermined(self, rows: Array, base_names: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the base parameters that rows (k, b + 1) do not determine individually."""
-        known = self.layout.owned_by(self.constraints.pinned)
-        before = base_spread(self.K, self.prior_std, known)
-        return determine(base_names, rows[:, :-1], before).undetermined
 
     def _details(self, pi: Array) -> dict[str, Any]:
         """Return the settings of the fit and its active constraints, as plain values."""
@@ -593,12 +585,9 @@ def log_evidence(fit: Consistent, rows: Array) -> Callable[[float], float]:
 
 
 def _search(
-    score: Callable[[float], tuple[float, Array]],
-    how: str,
-    allowed: float,
-    least: Array | None = None,
-    usual: float = _SMALLEST,
-) -> WeightChoice:
+    score: Callable[[float], tuple[float, Array]], how: str, allowed: float,
+    least: Array | None = None, usual: float = _SMALLEST,
+) -> WeightChoice:  # fmt: skip
     """Return the largest weight that ``_is_accepted`` in comparison with that of smallest score.
 
     ``score`` returns the score and its parts by segment and joint, or none. Below the usual

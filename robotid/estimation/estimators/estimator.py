@@ -10,8 +10,7 @@ import scipy.special
 
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
-from robotid.dynamics.factors import Factors, compress
-from robotid.dynamics.problem import Problem
+from robotid.dynamics.factors import Factors, Problem, compress
 
 DataT = TypeVar("DataT", contravariant=True)
 

@@ -12,8 +12,7 @@ from scipy.linalg.lapack import dtpqrt
 
 from robotid.base.exceptions import DataError, RankDeficientError
 from robotid.base.typing import Array
-from robotid.dynamics.factors import Factors
-from robotid.dynamics.problem import Problem, Sample, shuffled
+from robotid.dynamics.factors import Factors, Problem, Sample, shuffled
 from robotid.estimation.estimators.batch import SILENT, solve_factor
 from robotid.estimation.estimators.determination import PRIOR_LED
 from robotid.estimation.estimators.estimator import (

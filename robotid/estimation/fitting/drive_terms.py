@@ -12,8 +12,8 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.dynamics.constraint_rows import without_forces
-from robotid.dynamics.prediction import drive_motion_along
 from robotid.dynamics.rows import friction_directions
+from robotid.dynamics.torque import drive_motion_along
 from robotid.estimation.fitting.evaluation import Recording
 from robotid.robot.drive_term import DriveMotion, DriveTerm, Family
 from robotid.robot.drives import FAMILIES

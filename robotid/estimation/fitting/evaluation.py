@@ -16,7 +16,7 @@ from robotid.data.log import Log, Trajectory, alike_motions
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import turns_note
 from robotid.dynamics.factors import Factors, merge
-from robotid.dynamics.prediction import predict
+from robotid.dynamics.torque import predict
 from robotid.estimation.fitting.recorded import LogPiece, SurveyedLog
 from robotid.estimation.work_plan import WorkPlan
 from robotid.robot.model import RobotModel
@@ -85,28 +85,20 @@ class TorqueSums:
         def squares(values: Array) -> Array:
             return np.asarray(np.sum(values**2, axis=0, where=mask))
 
-        return cls(
-            rows=rows,
-            mean=mean,
-            spread=squares(tau - mean),
-            torque=squares(tau),
-            residual=squares(tau - prediction),
-            baselines={name: squares(tau - torque) for name, torque in baselines.items()},
-        )
+        others = {name: squares(tau - torque) for name, torque in baselines.items()}
+        return cls(rows, mean, squares(tau - mean), squares(tau), squares(tau - prediction), others)
 
     def merge(self, other: "TorqueSums") -> "TorqueSums":
         """Return the sums over the rows of both (Chan, Golub, LeVeque, 1983, variance, (2.1))."""
         rows = self.rows + other.rows
         share = other.rows / np.maximum(rows, 1)
         step = other.mean - self.mean
+        mean, between = self.mean + share * step, step**2 * self.rows * share
+        baselines = {name: x + other.baselines[name] for name, x in self.baselines.items()}
         return TorqueSums(
-            rows=rows,
-            mean=self.mean + share * step,
-            spread=self.spread + other.spread + step**2 * self.rows * share,
-            torque=self.torque + other.torque,
-            residual=self.residual + other.residual,
-            baselines={name: x + other.baselines[name] for name, x in self.baselines.items()},
-        )
+            rows, mean, self.spread + other.spread + between, self.torque + other.torque,
+            self.residual + other.residual, baselines,
+        )  # fmt: skip
 
     def metrics(self, names: Sequence[str], units: Sequence[str]) -> Metrics:
         """Return the metrics computed from the sums."""
@@ -309,15 +301,9 @@ def _score_logs(
 
 
 def _score(
-    piece: LogPiece,
-    threads: int | None,
-    *,
-    parameters: Mapping[str, Array],
-    prior: Array | None,
-    driven: Array | None,
-    sought: Sequence[Array] = (),
-    shown_rows: slice | None = None,
-) -> _Score:
+    piece: LogPiece, threads: int | None, *, parameters: Mapping[str, Array], prior: Array | None,
+    driven: Array | None, sought: Sequence[Array] = (), shown_rows: slice | None = None,
+) -> _Score:  # fmt: skip
     """Return the result of a piece, with the torques of the rows that are shown."""
     rows, model = piece.read(), piece.model
     motion, mask = rows.trajectory, rows.mask
@@ -359,12 +345,9 @@ def _shown_rows(piece: LogPiece) -> slice | None:
 
 
 def _predict_all(
-    model: RobotModel,
-    trajectory: Trajectory,
-    parameters: Mapping[str, Array],
-    prior: Array | None,
-    compiled: bool | None,
-) -> dict[str, Array]:
+    model: RobotModel, trajectory: Trajectory, parameters: Mapping[str, Array],
+    prior: Array | None, compiled: bool | None,
+) -> dict[str, Array]:  # fmt: skip
     """Return the torques by each set of parameters and by the URDF's gravity, (N, n_rows) each."""
     names = [*parameters] if prior is None else [*parameters, "gravity_only"]
     if not len(trajectory.t) or not names:

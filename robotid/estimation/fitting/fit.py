@@ -16,7 +16,7 @@ from robotid.base.exceptions import NotConvergedError, RankDeficientError, Setti
 from robotid.base.typing import Array
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors, Reduction, gather, join
-from robotid.dynamics.prediction import body_slopes_by_position, is_loaded
+from robotid.dynamics.torque import body_slopes_by_position, is_loaded
 from robotid.estimation import estimators
 from robotid.estimation.estimators import WLS, Consistent, Constraints, Estimate
 from robotid.estimation.estimators.consistent_fit import (
@@ -60,8 +60,7 @@ from robotid.estimation.variation.groups import (
     sums_of,
     with_zeros,
 )
-from robotid.robot.bodies import held_parameters, negligible_bodies
-from robotid.robot.geometry import body_boxes
+from robotid.robot.bodies import body_boxes, held_parameters, negligible_bodies
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
@@ -236,13 +235,9 @@ class Solved:
         logs = self.recordings
         fitted, validation = evaluate_logs(logs.fitted, logs.validation, {}, None, plan=logs.plan)
         return Solution(
-            model=logs.model,
-            mapping=logs.mapping,
-            prior_std=self.prior_std,
-            standard=self.standard,
-            fitted=fitted,
-            validation=validation,
-        )
+            model=logs.model, mapping=logs.mapping, prior_std=self.prior_std,
+            standard=self.standard, fitted=fitted, validation=validation,
+        )  # fmt: skip
 
     def with_errors(self) -> Fit:
         """Return the fit: the parameters with their standard errors and predictions."""
@@ -263,28 +258,15 @@ class Solved:
         sums = self._sums()
         _, unit = np.unique([log.unit for log in logs.fitted], return_inverse=True)
         fit = Fit(
-            model=logs.model,
-            mapping=mapping,
-            estimator=self.choice,
-            estimate=estimate,
-            wls=wls,
-            prior=before.pi,
-            urdf_with_drives=driven,
-            prior_std=self.prior_std,
-            standard=self.standard,
-            standard_covariance=covariance,
-            base=mapping.to_base(self.standard),
-            base_error=base_error,
-            fitted=fitted,
-            validation=validation,
-            errors=errors,
-            factors=ground.factors,
-            determination=ground.determination,
-            regressor_noise=ground.noise,
-            sums=sums,
+            model=logs.model, mapping=mapping, estimator=self.choice, estimate=estimate, wls=wls,
+            prior=before.pi, urdf_with_drives=driven, prior_std=self.prior_std,
+            standard=self.standard, standard_covariance=covariance,
+            base=mapping.to_base(self.standard), base_error=base_error,
+            fitted=fitted, validation=validation, errors=errors, factors=ground.factors,
+            determination=ground.determination, regressor_noise=ground.noise, sums=sums,
             runs=() if sums is None else runs_of(logs.model, mapping, self.standard, sums, unit),
             left_out=self._left_out(fitted),
-        )
+        )  # fmt: skip
         is_hidden = (K[:, ~fit.at_bound] == 0).all(axis=1)  # sums of terms at bounds only
         return replace(fit, base_error=np.where(is_hidden, np.inf, base_error))
 
@@ -463,13 +445,11 @@ def _without_regressor_noise(ground: _Ground, choice: EstimatorSettings) -> _Gro
         return replace(ground, noise=noise)
     logs = tuple(tuple(part.without(noise.shift) for part in log) for log in ground.logs)
     return replace(
-        ground,
+        ground, logs=logs, noise=noise,
         reduction=replace(ground.reduction, factors=ground.factors.without(noise.shift)),
         before=replace(ground.before, held_out=tuple(chain.from_iterable(logs))),
-        logs=logs,
         rough=replace(ground.rough, theta=theta - noise.shift),
-        noise=noise,
-    )
+    )  # fmt: skip
 
 
 def _run(

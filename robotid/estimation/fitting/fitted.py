@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.settings import is_number, require_kind
 from robotid.base.typing import Array, real_numbers
-from robotid.data.log import suggestion
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors
 from robotid.dynamics.friction_projection import (
@@ -21,7 +20,7 @@ from robotid.dynamics.friction_projection import (
     drive_moments,
     projected_pinocchio_model,
 )
-from robotid.dynamics.prediction import drive_motion_along, predict_instants
+from robotid.dynamics.torque import drive_motion_along, predict_instants
 from robotid.estimation.estimators import Estimate
 from robotid.estimation.estimators.determination import Determination, is_poorly_excited
 from robotid.estimation.fitting.drive_terms import DriveChoice, JointMotion, OpenTerm, open_torques

@@ -33,8 +33,16 @@ from robotid.data.signals import (
 from robotid.data.units import check_reach, check_units
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.constraint_rows import constrained, logged_base
-from robotid.dynamics.factors import Factors, Reduction, compress, compress_segments, join_segments
-from robotid.dynamics.prediction import is_loaded, remember
+from robotid.dynamics.factors import (
+    Block,
+    Factors,
+    Problem,
+    Reduction,
+    compress,
+    compress_segments,
+    concatenate,
+    join_segments,
+)
 from robotid.dynamics.prepared_logs import (
     base_problem,
     closed_log,
@@ -44,8 +52,8 @@ from robotid.dynamics.prepared_logs import (
     static_rows,
     with_contacts,
 )
-from robotid.dynamics.problem import Block, Problem, concatenate
 from robotid.dynamics.rows import COMPILED, choose_engine, friction_speeds, keep_inertial_rows
+from robotid.dynamics.torque import is_loaded, remember
 from robotid.estimation.work_plan import WorkPlan
 from robotid.robot.model import RobotModel
 
@@ -436,12 +444,9 @@ def _close_looks(first: int, stop: int) -> list[tuple[int, int]]:
 
 
 def _positions(
-    names: Mapping[str, str],
-    windows: Sequence[Mapping[str, Array]],
-    layout: LogLayout,
-    model: RobotModel,
-    inside: slice = slice(None),
-) -> dict[str, Array]:
+    names: Mapping[str, str], windows: Sequence[Mapping[str, Array]], layout: LogLayout,
+    model: RobotModel, inside: slice = slice(None),
+) -> dict[str, Array]:  # fmt: skip
     """Return the positions of locked joints in the rows read, by joint [rad or m]."""
     revolute = {joint.name for joint in model.tree.movable if joint.type != "prismatic"}
     positions = {}

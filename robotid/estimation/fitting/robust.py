@@ -10,7 +10,7 @@ from robotid.base.exceptions import NotConvergedError, SettingsError
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.dynamics.factors import join
-from robotid.dynamics.prediction import predict
+from robotid.dynamics.torque import predict
 from robotid.estimation.estimators import WLS
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.recorded import Recordings

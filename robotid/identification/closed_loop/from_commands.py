@@ -19,8 +19,8 @@ from robotid.diagnosis.verdict.parameter_table import correlated_sets
 from robotid.diagnosis.verdict.verdict import Verdict, blocking, judge_positions
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.friction_projection import DriveMoments, drive_moments
-from robotid.dynamics.prediction import predict_instants
 from robotid.dynamics.simulation.loops import Loops, open_loops
+from robotid.dynamics.torque import predict_instants
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import segment_scores
 from robotid.estimation.fitting.estimator_settings import SimulationSettings

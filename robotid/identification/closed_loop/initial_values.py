@@ -16,10 +16,10 @@ from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import zero_phase
-from robotid.dynamics.compiled import flatten
-from robotid.dynamics.prediction import predict_instants
+from robotid.dynamics.rows import flatten
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, Loops, Window
 from robotid.dynamics.simulation.simulation_settings import PerJoint
+from robotid.dynamics.torque import predict_instants
 from robotid.estimation.estimators.output_error import OutputError
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.loop_simulator import (

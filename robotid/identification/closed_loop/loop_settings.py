@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from robotid.base.exceptions import SettingsError
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.settings import Entries, Range, Settings, setting
-from robotid.data.log import suggestion
 from robotid.dynamics.simulation.simulation_settings import DELAY, GAIN, LEVEL, PerJoint
 
 _CLOCK = Range("1 to 2e4 Hz", lambda x: 1.0 <= x <= 2e4)

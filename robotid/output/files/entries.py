@@ -334,18 +334,11 @@ def loop_parameters(found: "PositionIdentification") -> list[dict[str, Any]]:
     if found.loop.kind == "torque":
         return []
     loops, estimate = found.fit.loops, found.fit.estimate
-    errors = {
-        (unknown.what, j): (
-            float(error),
-            float(quantile),
-            "bound" if unknown.name in estimate.details["at_bound"] else "data",
-        )
-        for unknown, error, quantile in zip(
-            found.fit.simulator.free_parameters, estimate.std_error, estimate.quantile, strict=True
-        )
-        for j in unknown.joints
-    }
-    entries = []
+    free, errors, entries = found.fit.simulator.free_parameters, {}, []
+    for parameter, error, quantile in zip(free, estimate.std_error, estimate.quantile, strict=True):
+        source = "bound" if parameter.name in estimate.details["at_bound"] else "data"
+        for j in parameter.joints:
+            errors[parameter.what, j] = float(error), float(quantile), source
     for j, joint in enumerate(found.model.limits):
         force, length = ("N", "m") if joint.type == "prismatic" else ("N m", "rad")
         units = {
@@ -355,11 +348,10 @@ def loop_parameters(found: "PositionIdentification") -> list[dict[str, Any]]:
         for what, unit in units.items():
             value = float(getattr(loops, what)[j])
             if math.isfinite(value):
-                error, quantile, source = errors.get((what, j), (None, None, "stated"))
+                std_error, reach, source = errors.get((what, j), (None, None, "stated"))
                 entries.append(
-                    {"name": f"{joint.name}.{what}", "value": value, "std_error": error,
-                     "quantile": quantile,
-                     "unit": unit, "source": source}
+                    {"name": f"{joint.name}.{what}", "value": value, "std_error": std_error,
+                     "quantile": reach, "unit": unit, "source": source}
                 )  # fmt: skip
     return entries
 

@@ -25,8 +25,7 @@ from robotid.base.versions import __version__
 from robotid.dynamics.friction_projection import Projection, project_friction
 from robotid.output.files.result_file import CommandedDrive, Result, commanded_drives
 from robotid.output.files.urdf import DYNAMICS_TERMS, ROUNDING, link_parameters, write_urdf
-from robotid.robot.bodies import inertial_parameters, link_places
-from robotid.robot.geometry import Shape, find_mesh, read_shapes
+from robotid.robot.bodies import Shape, find_mesh, inertial_parameters, link_places, read_shapes
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.tree import Joint

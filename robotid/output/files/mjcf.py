@@ -49,11 +49,8 @@ FORMAT = Format(
 )  # fmt: skip
 #: Attribute of a joint, or of a tendon over several joints, for each term of a drive.
 _ATTRIBUTES = {
-    "armature": "armature",
-    "viscous": "damping",
-    "coulomb": "frictionloss",
-    "spring": "stiffness",
-}
+    "armature": "armature", "viscous": "damping", "coulomb": "frictionloss", "spring": "stiffness",
+}  # fmt: skip
 _OFFSET = "offset"  # the bias of the actuator states it
 _TERMS = (*_ATTRIBUTES, _OFFSET)
 #: Sizes of a geom divided by those of a shape in a URDF: MuJoCo uses half lengths.

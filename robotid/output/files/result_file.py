@@ -12,14 +12,14 @@ from numpy.typing import ArrayLike
 
 from robotid.base.exceptions import DataError, ModelError
 from robotid.base.files import check_path, moved_file, read_json
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.settings import require_kind
 from robotid.base.typing import Array
-from robotid.data.log import Log, suggestion
+from robotid.data.log import Log
 from robotid.diagnosis.verdict.parameter_table import parameter_table
 from robotid.diagnosis.verdict.scale_check import PayloadCheck, ScaleCheck, StatedMass
 from robotid.dynamics.friction_projection import DriveMoments, projected_pinocchio_model
-from robotid.dynamics.prediction import predict_instants
+from robotid.dynamics.torque import predict_instants
 from robotid.estimation.fitting.standard_errors import FrictionCurve
 from robotid.estimation.variation.groups import RunSums
 from robotid.estimation.variation.variation import between_covariance
@@ -175,9 +175,9 @@ class Result:
     @property
     def rate(self) -> float | None:
         """Sampling rate of the controller of those drives [Hz]; None for continuous time."""
-        stated = self.content.get("simulation", {"controller": {}})["controller"]
-        rate: float | None = stated.get("rate")
-        return rate
+        controller: dict[str, float | None]
+        controller = self.content.get("simulation", {"controller": {}})["controller"]
+        return controller.get("rate")
 
     def follow_commands(self, log: Log) -> Array:
         """Return the encoder readings simulated on a log's commands, (N, n) [rad or m]."""

@@ -19,8 +19,7 @@ from robotid.output.files.exports import (
 )
 from robotid.output.files.result_file import Result
 from robotid.output.files.urdf import numbers_text
-from robotid.robot.bodies import central_inertial
-from robotid.robot.geometry import Shape
+from robotid.robot.bodies import Shape, central_inertial
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import MOMENTS, Joint
 

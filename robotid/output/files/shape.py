@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from robotid.base.exceptions import DataError
+from robotid.base.settings import shown
 
 _ASSETS = Path(__file__).parent / "assets"
 _LARGEST = 1e100  # values of a robot are smaller; results of larger values may overflow
@@ -53,13 +54,11 @@ def check_shape(value: Any, wanted: Any, at: str) -> None:  # noqa: ANN401
             check_shape(entry, wanted[0], f"{at}[{k}]")
     elif wanted == "file":
         if not isinstance(value, str) or Path(value).name != value or "\0" in value:
-            raise DataError(
-                f"{at} is {_shown(value)}, wanted the name of a file in the same folder"
-            )
+            raise DataError(f"{at} is {shown(value)}, wanted the name of a file in the same folder")
     elif wanted in _KINDS:
         _check_kind(value, wanted, at)
     elif value not in wanted.split(", "):
-        raise DataError(f"{at} is {_shown(value)}, wanted one of {wanted}")
+        raise DataError(f"{at} is {shown(value)}, wanted one of {wanted}")
 
 
 def require_lengths(value: Any, shape: Sequence[int], at: str) -> None:  # noqa: ANN401
@@ -73,11 +72,6 @@ def require_lengths(value: Any, shape: Sequence[int], at: str) -> None:  # noqa:
 def _check_kind(value: object, kind: str, at: str) -> None:
     kinds = _KINDS[kind]
     if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
-        raise DataError(f"{at} is {_shown(value)}, wanted {_WORDS.get(kind, kind)}")
+        raise DataError(f"{at} is {shown(value)}, wanted {_WORDS.get(kind, kind)}")
     if isinstance(value, int | float) and abs(value) > _LARGEST:
-        raise DataError(f"{at} is {_shown(value)}, wanted a number of at most {_LARGEST:g}")
-
-
-def _shown(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+        raise DataError(f"{at} is {shown(value)}, wanted a number of at most {_LARGEST:g}")

@@ -30,12 +30,8 @@ _KINDS = {"urdf": "URDF", "sidecar": "drive parameters"}  # of files, by key of 
 _DOCK = '<div id="replay" class="dock"'
 #: Scripts, and the pattern of pages that need them.
 _SCRIPTS = {
-    "page.js": '<details|<table class="data"',
-    "tables.js": '<table class="data"',
-    "dock.js": _DOCK,
-}
-
-
+    "page.js": '<details|<table class="data"', "tables.js": '<table class="data"', "dock.js": _DOCK,
+}  # fmt: skip
 #: A column of a table: its heading, the form of its cells (``cell``), its key in an entry.
 Column = tuple[str, str, str]
 
@@ -157,17 +153,16 @@ def table(
 ) -> str:
     """Return the HTML of a table in a box that scrolls on narrow pages."""
     first = rows[0] if rows else [Cell("")] * len(headers)
-    kinds = ["number" if cell.kind == "number" else "text" for cell in first]
-    head = "".join(
-        f'<th scope="col" class="{kind}">{escape(title)}</th>'
-        for title, kind in zip(headers, kinds, strict=True)
-    )
+    head = ""
+    for title, cell in zip(headers, first, strict=True):
+        kind = "number" if cell.kind == "number" else "text"
+        head += f'<th scope="col" class="{kind}">{escape(title)}</th>'
     body = "".join(_row(row, is_data=is_data) for row in rows)
     last = f"<tfoot>{_row(foot)}</tfoot>" if foot else ""
-    title, kind = escape(caption), ' class="data"' if is_data else ""
+    title, data = escape(caption), ' class="data"' if is_data else ""
     return (
         f'<div class="scroll" tabindex="0" role="region" aria-label="{title}">'
-        f"<table{kind}><caption>{title}</caption>"
+        f"<table{data}><caption>{title}</caption>"
         f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody>{last}</table></div>\n"
     )
 
@@ -345,30 +340,14 @@ def chart_html(chart: Chart, caption: str, *, points: int = POINTS) -> str:
     """Return a chart as a figure: numbers of 16 bits, exact to 1/65,000 of their range."""
     order = np.argsort(chart.x, kind="stable")
     x = np.asarray(chart.x, dtype=float)[order]
-    series = [(s, _sorted(s.y, order), _sorted(s.half, order)) for s in chart.series]
-    rows = _union([y for _, y, _ in series], points, len(x))
-    data = {
-        "title": chart.title,
-        "x": _axis(x[rows], chart, "x", "<u4"),
-        "series": [
-            {
-                "label": s.label,
-                "tone": s.tone,
-                "kind": s.kind,
-                "faint": s.is_weak,
-                "hidden": s.is_hidden,
-                "y": _axis(y[rows], chart, "y"),
-                "half": None if half is None else stepped(half[rows]),
-            }
-            for s, y, half in series
-        ],
-        "x_label": chart.x_label,
-        "y_label": chart.y_label,
-        "link": chart.link,
-        "spans": chart.spans,
-        "logarithmic": chart.logarithmic,
-        "height": chart.height,
-    }
+    lines = [(s, _sorted(s.y, order), _sorted(s.half, order)) for s in chart.series]
+    rows = _union([y for _, y, _ in lines], points, len(x))
+    series = [
+        {**vars(s), "y": _axis(y[rows], chart, "y"),
+         "half": None if half is None else stepped(half[rows])}
+        for s, y, half in lines
+    ]  # fmt: skip
+    data = {**vars(chart), "x": _axis(x[rows], chart, "x", "<u4"), "series": series}
     text = script_json(data)
     head = f"<figcaption>{caption}</figcaption>" if caption else ""
     return (

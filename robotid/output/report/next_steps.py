@@ -7,7 +7,7 @@ import shlex
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -270,11 +270,6 @@ def _gains(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause])
     return _step("gains", origin, _payload_gains(found), joints or {"JOINT": "GAIN"}, joints=names)
 
 
-def _delay(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    delays = [finding.evidence["delay"] for cause in causes for finding in cause.findings]
-    return _step("delay", origin, delay=f"{sum(delays) / len(delays):.4f}")
-
-
 def _locks(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     joints = list(found.model.locked)
     places = {
@@ -285,13 +280,6 @@ def _locks(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause])
     }
     values = places or dict.fromkeys(joints if len(joints) <= NAMED else ["*"], "POSITION")
     return _step("locks", origin, (), values, joints=listed(places or joints, NAMED))
-
-
-def _pin(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    joints = {joint for cause in causes for joint in cause.joints}
-    links = [joint.child for joint in found.model.tree.movable if joint.name in joints]
-    text = json.dumps(links, ensure_ascii=False)
-    return _step("pin", origin, joints=_named(causes), links=text)
 
 
 def _terms(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
@@ -327,12 +315,6 @@ def _payload(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause
     return _step("payload", origin, origin.using("payload", *words))
 
 
-def _zeros(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    sizes = [f for cause in causes for f in cause.findings if "size" in f.evidence]
-    by = "".join(f"; of {f.where} by {-f.evidence['size']:.3g}" for f in sizes)
-    return _step("zeros", origin, _inspection(found), joints=_named(causes), by=by)
-
-
 def _as_found(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     return Step(" ".join(f"{sentence_of(m)}." for cause in causes for m in cause.messages[:1]))
 
@@ -349,13 +331,24 @@ def _watch(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause])
     return _step("watch", origin, _replay(found, origin), joints=where, why=why)
 
 
-def _unclipped(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    return _step("unclipped", origin, _another_log(origin), joints=_named(causes))
-
-
-def _richer(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    count = len(found.determination.undetermined)
-    return _step("richer", origin, _another_log(origin), count=count)
+def _plain(name: str, found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    """Return a step of steps.toml with figures of the result and of its findings."""
+    findings = [finding for cause in causes for finding in cause.findings]
+    joints = {joint for cause in causes for joint in cause.joints}
+    links = [joint.child for joint in found.model.tree.movable if joint.name in joints]
+    delays = [x.evidence["delay"] for x in findings if "delay" in x.evidence]
+    sizes = [(x.where, -x.evidence["size"]) for x in findings if "size" in x.evidence]
+    blocks: tuple[str, ...] = ()
+    if name in ("unclipped", "richer"):
+        blocks = _another_log(origin)
+    elif name in ("inspect", "zeros"):
+        blocks = (shlex.join(["robotid", "inspect", str(found.model.tree.path)]),)
+    return _step(
+        name, origin, blocks, joints=_named(causes), links=json.dumps(links, ensure_ascii=False),
+        by="".join(f"; of {where} by {size:.3g}" for where, size in sizes),
+        count=len(found.determination.undetermined), estimator=found.estimator.name,
+        delay=f"{sum(delays) / max(len(delays), 1):.4f}",
+    )  # fmt: skip
 
 
 def _another_log(origin: Origin) -> tuple[str, ...]:
@@ -364,10 +357,6 @@ def _another_log(origin: Origin) -> tuple[str, ...]:
         return (Origin((urdf, _NEW, *others), origin.folder).again(),)
     logs = (origin.again(),) if origin.job else ()
     return (f'[[identification]]\nlog = "{_NEW}"', *logs)
-
-
-def _inspection(found: TorqueIdentification) -> tuple[str, ...]:
-    return (shlex.join(["robotid", "inspect", str(found.model.tree.path)]),)
 
 
 def _doctor(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
@@ -397,15 +386,12 @@ def _replay(found: Identification, origin: Origin) -> tuple[str, ...]:
 
 #: The steps, the most informative first, by the name that the catalogue of findings gives them.
 _STEPS: Mapping[str, Callable[[TorqueIdentification, Origin, Sequence[Cause]], Step]] = {
-    "doctor": _doctor, "scale": _scale, "gains": _gains, "delay": _delay, "locks": _locks,
-    "zeros": _zeros, "payload": _payload, "unclipped": _unclipped, "terms": _terms,
-    "as_found": _as_found,
-    "validate": lambda found, origin, causes: _step("validate", origin),
-    "possible": lambda found, origin, causes: _step(
-        "possible", origin, estimator=found.estimator.name
-    ),
-    "watch": _watch, "pin": _pin, "richer": _richer,
-    "inspect": lambda found, origin, causes: _step("inspect", origin, _inspection(found)),
+    "doctor": _doctor, "scale": _scale, "gains": _gains, "delay": partial(_plain, "delay"),
+    "locks": _locks, "zeros": partial(_plain, "zeros"), "payload": _payload,
+    "unclipped": partial(_plain, "unclipped"), "terms": _terms, "as_found": _as_found,
+    "validate": partial(_plain, "validate"), "possible": partial(_plain, "possible"),
+    "watch": _watch, "pin": partial(_plain, "pin"), "richer": partial(_plain, "richer"),
+    "inspect": partial(_plain, "inspect"),
 }  # fmt: skip
 #: Those of causes of a verdict that no finding names.
 _OF_VERDICT = {

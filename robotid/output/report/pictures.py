@@ -4,17 +4,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robotid.base.exceptions import DataError
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 from robotid.base.settings import require_kind
 from robotid.base.typing import Array
-from robotid.data.log import suggestion
 from robotid.diagnosis.residual.torque_split import (
     Dependence,
     JointTorque,
     friction_split,
     spread_rows,
 )
-from robotid.dynamics.prediction import drive_motion_along
+from robotid.dynamics.torque import drive_motion_along
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.fitted import friction_curve
 from robotid.estimation.fitting.standard_errors import QUANTILE, TorqueBand
@@ -25,16 +24,10 @@ _DWARFED = 4.0  # times the height of the measured torque above which the URDF's
 _PIXELS = 500  # spans closer than one of these pixels are merged
 _POINTS = 400  # of a chart of the residual analysis, or of friction
 _TONES = {
-    "gravity": "tone-1",
-    "inertia": "tone-4",
-    "Coriolis": "tone-7",
-    "friction": "tone-3",
-    "motor inertia": "tone-6",
-    "offset": "tone-8",
-    "spring": "tone-5",
-    "ripple": "urdf",
+    "gravity": "tone-1", "inertia": "tone-4", "Coriolis": "tone-7", "friction": "tone-3",
+    "motor inertia": "tone-6", "offset": "tone-8", "spring": "tone-5", "ripple": "urdf",
     "delay": "quiet",
-}
+}  # fmt: skip
 
 
 def plot_torques(

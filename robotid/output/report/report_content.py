@@ -54,18 +54,8 @@ from robotid.output.pages.html import (
     verdict_html,
 )
 from robotid.output.report import pictures, tables
-from robotid.output.report.errors import (
-    POSITION,
-    TORQUE,
-    Errors,
-    Quantity,
-    error_bars,
-    error_table,
-    errors_of,
-    worst_errors,
-)
 from robotid.output.report.next_steps import Origin, Step, next_steps
-from robotid.output.report.tables import sources_fact
+from robotid.output.report.tables import POSITION, TORQUE, Errors, Quantity, errors_of, worst_errors
 
 if TYPE_CHECKING:
     from robotid.identification.closed_loop.from_commands import PositionIdentification
@@ -104,7 +94,7 @@ def page_of(found: Identification, report: Report, origin: Origin, files: Mappin
     rows, verdicts = found.model.row_names, found.verdict.to_dict()["per_joint"]
     definition, after = report.errors
     every = errors_of(found)
-    tables = "".join(error_table(report.quantity, x, rows, verdicts) for x in every)
+    shown = "".join(tables.error_table(report.quantity, x, rows, verdicts) for x in every)
     count = sum(entry["source"] in ("data", "mixed") for entry in report.entries)
     determined = f"{count} of {len(report.entries)} determined by the data, fully or partly"
     parts = report.appendix.items()
@@ -116,7 +106,10 @@ def page_of(found: Identification, report: Report, origin: Origin, files: Mappin
     worst = escape(next(iter(worst_errors(report.counted)), ""))
     sections = {
         "errors": Section(
-            "Errors", f"{definition}{tables}{after}", f"{len(verdicts)} joints, by recording", False
+            "Errors",
+            f"{definition}{shown}{after}",
+            f"{len(verdicts)} joints, by recording",
+            False,
         ),
         "findings": Section("Findings", findings, tally(serious, notes, worst) or "none", False),
         "friction": Section("Friction against speed", report.friction),
@@ -140,14 +133,14 @@ def first_screen(
     verdict = found.verdict.to_dict()
     uses = uses_line(verdict.get("use_for", {}))
     uses = f"{uses[:1].upper()}{uses[1:]}." if uses else ""
-    bars = error_bars(
+    bars = tables.error_bars(
         report.quantity, report.counted, found.model.row_names, verdict["per_joint"],
         has_why=bool(report.why),
     )  # fmt: skip
     return block(
         "report.first",
         verdict=verdict_html(found.model.name, verdict["status"], verdict["reasons"], uses),
-        facts=facts_html({**report.facts, **sources_fact(report.entries)}, files),
+        facts=facts_html({**report.facts, **tables.sources_fact(report.entries)}, files),
         bars=bars,
         steps=_steps(next_steps(found, origin)),
     )

@@ -24,7 +24,7 @@ from robotid.base.files import write_text
 from robotid.base.settings import is_number, require_each, require_kind
 from robotid.base.typing import Array, real_numbers
 from robotid.output.pages.html import asset, packed, scaffold, script_json, stepped
-from robotid.robot.geometry import Shape, Surface, find_mesh, joined, read_shapes, read_surfaces
+from robotid.robot.bodies import Shape, Surface, find_mesh, joined, read_shapes, read_surfaces
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 

@@ -32,7 +32,7 @@ from robotid.data.base_motion import BaseColumns, base_state
 from robotid.data.files import csv_files, parquet_files
 from robotid.data.files.parquet_files import read_text_table, write_rows
 from robotid.data.files.read import lay_out, open_table, read_log, write_columns, write_log
-from robotid.data.files.table import Place, RowReader, Table, with_even_stamps
+from robotid.data.files.table import Place, Table, with_even_stamps
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource, LogUnits
 
@@ -45,12 +45,9 @@ def make_log(count=60, **changes):
     t = 1000.0 + np.arange(count) / 50
     phase = t[:, None] * [2.0, 3.0]
     fields = {
-        "t": t,
-        "q": np.sin(phase),
-        "v": np.cos(phase) * [2.0, 3.0],
-        "tau": 10 * np.cos(phase),
+        "t": t, "q": np.sin(phase), "v": np.cos(phase) * [2.0, 3.0], "tau": 10 * np.cos(phase),
         "joints": JOINTS,
-    }
+    }  # fmt: skip
     return Log(**(fields | changes))
 
 
@@ -96,17 +93,14 @@ def bag(path, log, **how):
 FORMATS = {
     "mcap": (".mcap", lambda path, log: write_mcap(path, messages_of(log))),
     "mcap folder": (".", lambda path, log: bag(path, log, plugin=StoragePlugin.MCAP)),
-    "ros2 folder": (".", bag),
-    "db3": (".", lambda path, log: next(bag(path, log).glob("*.db3"))),
-    "ros1": (".bag", lambda path, log: write_bag1(path, messages_of(log))),
-    "npz": (".npz", npz),
-    "npz columns": (".npz", npz_columns),
-    "hdf5": (".h5", hdf5),
+    "ros2 folder": (".", bag), "db3": (".", lambda path, log: next(bag(path, log).glob("*.db3"))),
+    "ros1": (".bag", lambda path, log: write_bag1(path, messages_of(log))), "npz": (".npz", npz),
+    "npz columns": (".npz", npz_columns), "hdf5": (".h5", hdf5),
     "mat struct": (".mat", lambda path, log: write_mat5(path, {"log": wide(log), "comment": "x"})),
     "mat joints by samples": (".mat", across),
     "mat 7.3": (".mat", lambda path, log: write_mat73(path, wide(log, object))),
     "mat 7.3 struct": (".mat", lambda path, log: write_mat73(path, {"log": wide(log, object)})),
-}
+}  # fmt: skip
 
 
 def recorded(name, folder, log):
@@ -255,8 +249,9 @@ def test_rows_of_a_csv_file_with_blank_lines_have_their_places(tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet", ".npz"])
-def test_even_stamps_are_the_line_through_those_of_the_rows(tmp_path, suffix):
-    """A file of a joint whose rows wait for every fifth one, in ms."""
+def test_even_stamps_are_the_line_through_those_of_the_rows(tmp_path, monkeypatch, suffix):
+    """A file of a joint whose rows wait for every fifth one, in ms; of CSV read in six blocks."""
+    monkeypatch.setattr(csv_files, "_BLOCK", 90)
     k = np.arange(500)
     t = 7000.0 + 4.0 * (k // 5 * 5 + 4) + 0.01 * (k % 5)
     path = tmp_path / f"log{suffix}"
@@ -268,6 +263,7 @@ def test_even_stamps_are_the_line_through_those_of_the_rows(tmp_path, suffix):
     layout, table = lay_out(path, ["a"], **how)
     reader = table.reader(layout.wanted)
     blocks = list(reader.scan("time"))
+    assert len(blocks) == (6 if suffix == ".csv" else 1)
     np.testing.assert_allclose(np.concatenate([x for x, _ in blocks]) / 1e3, log.t, atol=1e-12)
     part = layout.to_log(reader.read(layout.wanted, 123, 321, blocks[0][1]), 123)
     np.testing.assert_allclose(part.t, log.t[123:321], atol=1e-12)
@@ -279,35 +275,11 @@ def test_even_stamps_are_the_line_through_those_of_the_rows(tmp_path, suffix):
     np.testing.assert_array_equal(out["q_a"], np.sin(0.01 * k))
 
 
-class Blocks(RowReader):
-    """Rows in blocks of unlike lengths, the first one empty."""
-
-    def __init__(self, t):
-        self.t, self.parts = t, np.split(t, [0, 3, 50, 51])
-
-    def count(self):
-        return len(self.t)
-
-    def scan(self, name):
-        yield from ((part if name == "time" else -part, k) for k, part in enumerate(self.parts))
-
-    def read(self, wanted, first, stop, near):
-        return {name: (1 if name == "time" else -1) * self.t[first:stop] for name in wanted}
-
-
-def test_the_line_is_that_through_all_blocks_of_a_long_file(rng):
-    t = 1.7e9 + 0.004 * np.arange(90) + 0.001 * rng.random(90)
-    even = with_even_stamps(Table(["time", "q"], lambda names: {}, rows=Blocks(t)), "time").rows
-    k = np.arange(90)
+def test_the_line_is_that_of_stamps_since_the_epoch_and_of_a_single_one(rng):
+    k, t = np.arange(90), 1.7e9 + 0.004 * np.arange(90) + 0.001 * rng.random(90)
     step, start = np.polyfit(k, t - t[0], 1)
-    wanted = start + step * k
-    blocks = list(even.scan("time"))
-    assert [(len(x), place) for x, place in blocks] == [(0, 0), (3, 1), (47, 2), (1, 3), (39, 4)]
-    np.testing.assert_allclose(np.concatenate([x for x, _ in blocks]) - t[0], wanted, atol=1e-6)
-    np.testing.assert_array_equal(np.concatenate([x for x, _ in even.scan("q")]), -t)
-    part = even.read(["q", "time"], 40, 60, 2)
-    np.testing.assert_allclose(part["time"] - t[0], wanted[40:60], atol=1e-6)
-    np.testing.assert_array_equal(part["q"], -t[40:60])
+    table = with_even_stamps(Table(["time"], lambda names: {"time": t}), "time")
+    np.testing.assert_allclose(table.read(["time"])["time"] - t[0], start + step * k, atol=1e-6)
     one = with_even_stamps(Table(["time"], lambda names: {"time": np.array([3.0])}), "time")
     assert one.read(["time"]) == {"time": [3.0]}
 

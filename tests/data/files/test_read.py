@@ -4,15 +4,18 @@ import re
 import subprocess
 import sys
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
+from helpers.recorders import wide
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.data.base_motion import BaseColumns
-from robotid.data.files.read import lay_out, read_log, write_columns, write_log
-from robotid.data.log import Log
+from robotid.data.files.columns import quantity_of
+from robotid.data.files.read import lay_out, read_log, read_logs, write_columns, write_log
+from robotid.data.log import COLUMNS, Log
 from robotid.data.signal_settings import LogSource, LogUnits, Transmission
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -439,14 +442,18 @@ OFFSET, EFFICIENCY = np.array([0, 0.3, -1.2]), np.array([0.8, 0.9, 0.7])
 
 @pytest.fixture
 def motion(rng):
-    """Positions, speeds and torques of the joints, by kind."""
-    return {kind: rng.uniform(-1, 1, (20, 3)) for kind in ("q", "dq", "tau")}
+    """Positions, speeds and torques of the joints and their commands, by kind."""
+    kinds = [f"{kind}{ref}" for ref in ("", "ref") for kind in ("q", "dq", "tau")]
+    return {kind: rng.uniform(-1, 1, (20, 3)) for kind in kinds}
 
 
 def motor_side(motion):
-    """What motors do that drive the joints so: w = T v, q_m = GEARS (q - q_0), power passes."""
-    tau_m = np.linalg.solve(GEARS.T, motion["tau"].T).T / EFFICIENCY
-    moved = {"qm": (motion["q"] - OFFSET) @ GEARS.T, "dqm": motion["dq"] @ GEARS.T, "taum": tau_m}
+    """What motors do that drive the joints so: w = T v, q_m = T (q - q_0), power passes."""
+    moved = {}
+    for ref in ("", "ref"):
+        moved[f"q{ref}m"] = (motion[f"q{ref}"] - OFFSET) @ GEARS.T
+        moved[f"dq{ref}m"] = motion[f"dq{ref}"] @ GEARS.T
+        moved[f"tau{ref}m"] = np.linalg.solve(GEARS.T, motion[f"tau{ref}"].T).T / EFFICIENCY
     return {"time": np.arange(20) / 100} | {
         f"{kind}_m{i + 1}": x[:, i] for kind, x in moved.items() for i in range(3)
     }
@@ -460,10 +467,10 @@ def save(path, table):
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_motor_columns_become_those_of_the_joints(tmp_path, motion, suffix):
     path = save(tmp_path / f"run{suffix}", motor_side(motion))
-    log = read_log(path, DRIVEN, transmissions=MOTORS)
+    log = read_log(path, DRIVEN, transmissions=MOTORS, needs="commands")
     assert log.notes == ()
-    for kind, values in (("q", log.q), ("dq", log.v), ("tau", log.tau)):
-        np.testing.assert_allclose(values, motion[kind], atol=1e-12)
+    for kind, values in motion.items():
+        np.testing.assert_allclose(getattr(log, COLUMNS[kind]), values, atol=1e-12)
     # without losses, the motors give the power that the joints take
     table, lossless = motor_side(motion), Transmission(**WRIST)
     own = read_log(path, DRIVEN, transmissions=(MOTORS[0], lossless))
@@ -588,3 +595,123 @@ def test_gear_ratios_of_the_urdf_are_used_only_if_asked_for():
         SettingsError,
     ):
         asked.stated({"wrist": 80.0})
+
+
+DEGREES = LogUnits(angle="deg")
+COMMANDED = replace(
+    LOG, v=None, a=None, tau=np.zeros((300, 2)), has_torque=False, q_ref=np.sin(PHASE + 0.1),
+    v_ref=np.cos(PHASE + 0.1) * [2.0, 3.0], tau_ref=10 * np.cos(PHASE),
+)  # fmt: skip
+
+
+def commanded(**more):
+    return frame(**NO_TAU, **of("qref", COMMANDED.q_ref), **more)
+
+
+def test_no_two_quantities_share_a_name():
+    assert quantity_of("q_des_elbow") == ("qref", "elbow")
+    assert quantity_of("q_elbow") == ("q", "elbow")
+    assert quantity_of("command_velocity_elbow") == ("dqref", "elbow")
+    assert quantity_of("effort_command_elbow") == ("tauref", "elbow")
+    for unread in ("target_current_0", "tau_q_elbow", "q_"):
+        assert quantity_of(unread) is None
+    assert quantity_of("effort_command_elbow", "current") is None
+
+
+def test_what_is_not_needed_is_not_read():
+    log = COMMANDED
+    table = {"time": log.t, **of("q", log.q), **of("qref", log.q_ref * np.nan)}
+    table |= of("tau", 3 * log.q)
+    given = pd.DataFrame(table)
+    torques = read_log(given, JOINTS)
+    assert (torques.has_torque, torques.q_ref) == (True, None)
+    assert torques.notes == ("columns ignored: qref_shoulder, qref_elbow",)
+    motion = read_log(given, JOINTS, needs="motion")
+    assert (motion.has_torque, motion.tau.any(), motion.q_ref) == (False, False, None)
+    with pytest.raises(DataError, match="qref_shoulder is NaN at row 0"):
+        read_log(given, JOINTS, needs="commands")
+
+
+@pytest.mark.parametrize(
+    ("torques", "commands", "read"),
+    [
+        (2, 2, "both"), (2, 1, "torque"), (2, 0, "torque"), (0, 2, "commands"),
+        (1, 2, "tau_elbow"), (1, 1, "tau_elbow"), (1, 0, "tau_elbow"), (0, 0, "tau_shoulder"),
+        (0, 1, "qref_elbow"),
+    ],
+)  # fmt: skip
+def test_of_torques_or_commands_what_there_is_must_be_whole(torques, commands, read):
+    """A joint without what another has is refused; not commands of some beside all torques."""
+    log = COMMANDED
+    table = {"time": log.t, **of("q", log.q)}
+    table |= {f"tau_{joint}": log.t + k for k, joint in enumerate(JOINTS[:torques])}
+    table |= {f"qref_{joint}": log.q_ref[:, k] for k, joint in enumerate(JOINTS[:commands])}
+    if "_" in read:
+        with pytest.raises(DataError, match=f"no columns? '{read}'"):
+            read_log(pd.DataFrame(table), JOINTS, needs="any")
+        return
+    found = read_log(pd.DataFrame(table), JOINTS, needs="any")
+    assert found.has_torque is (read != "commands")
+    wanted = log.t[:, None] + [0, 1] if found.has_torque else np.zeros((300, 2))
+    np.testing.assert_array_equal(found.tau, wanted)
+    assert (found.q_ref is None) is (read == "torque")
+    if found.q_ref is not None:
+        np.testing.assert_array_equal(found.q_ref, log.q_ref)
+
+
+def test_half_of_the_rest_is_noted():
+    part = np.ones(300)
+    log = read_log(commanded(dqref_elbow=part).assign(tau_elbow=part), JOINTS, needs="commands")
+    assert (log.v_ref, log.has_torque) == (None, False)
+    assert log.notes == (
+        "torques ignored: shoulder have no torque, and no current with a gain",
+        "dqref_elbow ignored: shoulder have no commanded velocity",
+        "columns ignored: tau_elbow",
+    )
+    currents = {f"current_{joint}": part for joint in JOINTS}
+    log = read_log(commanded(**currents), JOINTS, needs="commands")
+    assert not log.has_torque
+    log = read_log(
+        commanded(**currents), JOINTS, needs="commands", gains=dict.fromkeys(JOINTS, 2.0)
+    )
+    assert log.has_torque
+    assert (log.tau == 2.0).all()
+    half = commanded().assign(tau_shoulder=part)
+    log = read_log(half, JOINTS, needs="commands", passive=("elbow",))  # it needs no torque
+    np.testing.assert_array_equal(log.tau, np.column_stack([part, 0 * part]))
+    assert log.has_torque
+
+
+def test_degrees_and_wide_arrays_hold_for_commands(tmp_path):
+    log = COMMANDED
+    table = {"time": log.t, **of("q", np.rad2deg(log.q)), **of("tauref", log.tau_ref)}
+    table |= of("qref", np.rad2deg(log.q_ref)) | of("dqref", np.rad2deg(log.v_ref))
+    back = read_log(pd.DataFrame(table), JOINTS, needs="commands", units=DEGREES)
+    for name in ("q", "q_ref", "v_ref", "tau_ref"):
+        np.testing.assert_allclose(getattr(back, name), getattr(log, name), atol=1e-15)
+    how = {"needs": "commands", "units": DEGREES, "prismatic": ["elbow"]}
+    slid = read_log(pd.DataFrame(table), JOINTS, **how)
+    np.testing.assert_array_equal(slid.q_ref[:, 1], np.rad2deg(log.q_ref[:, 1]))
+    arrays = wide(Log(log.t, log.q, log.q, JOINTS, v=log.q))
+    np.savez(tmp_path / "run.npz", **arrays, q_des=log.q_ref)
+    back = read_log(tmp_path / "run.npz", JOINTS, needs="commands")
+    np.testing.assert_array_equal(back.q_ref, log.q_ref)
+
+
+def test_a_log_without_torque_is_told_what_it_can_do():
+    log = COMMANDED
+    for given, needs, fragment in (
+        (log, "torque", r'log has no torque. .* with estimator="simulation", controller={"kp": N'),
+        (Log(log.t, log.q, log.q, JOINTS), "commands", "log has no commanded positions; pass them"),
+    ):
+        with pytest.raises(DataError, match=fragment):
+            read_logs(given, JOINTS, needs=needs)
+    sizes = {f"loadsize_{joint}": np.ones(300) for joint in JOINTS}
+    assert read_log(commanded(**sizes), JOINTS, needs="commands").notes == (
+        "loadsize_shoulder, loadsize_elbow ignored: the absolute value of a load does not "
+        "determine the direction of the torque",
+    )
+    chosen = {f"tau_{joint}": f"loadsize_{joint}" for joint in JOINTS}
+    assert read_log(commanded(**sizes), JOINTS, columns=chosen).has_torque
+    with pytest.raises(DataError, match="has_torque is False, but tau is not 0"):
+        Log(log.t, log.q, log.q, JOINTS, has_torque=False)

@@ -37,8 +37,6 @@ def found(log):
 
 
 # --- nothing where nothing is ---------------------------------------------------------------------
-
-
 def test_forces_of_the_ground_identify_masses_without_torques_and_commands(log):
     bare = replace(log, q_ref=None, v_ref=None, tau_ref=None, tau=0.0 * log.tau, has_torque=False)
     (note,) = check_commands(bare)
@@ -76,8 +74,6 @@ def test_steps_and_pseudo_random_commands_are_fine(seed):
 
 
 # --- each fault by its own code -------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("fastest", [0.5, 1.0, 1.5])
 def test_a_chirp_below_the_bandwidth_does_not_tell_the_delay(fastest):
     slow = found(record(chirps([0.3, 0.3], fastest), GOOD))
@@ -212,7 +208,6 @@ def test_a_command_that_is_held_is_noted():
 
 
 # --- recordings -----------------------------------------------------------------------------------
-
 #: Findings above a note of each recording: go2's joints are all told one chirp; so101's jaw runs
 #: at 1.1 rad/s at most, its lift and elbow have a dead band, and slow motions show no delay.
 RECORDED = {
@@ -245,8 +240,6 @@ def test_recordings_show_what_is_wrong_with_them(name):
 
 
 # --- the doctor as a whole ------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def of_ur5(ur5):
     """A log of a UR5 whose joints have servos of their own."""

@@ -5,12 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.legged import with_other_bodies
+from helpers.stands import recorded, stand
 
 from robotid.data.base_motion import BaseMotion, base_state
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
-from robotid.diagnosis.logs.base_checks import check_base
+from robotid.diagnosis.logs.base_checks import check_base, check_wrenches
+from robotid.dynamics.constraint_rows import constraint_jacobian
+from robotid.dynamics.torque import predict
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -104,15 +108,9 @@ def test_the_radius_of_a_rolling_foot_is_found(robot, ball):
 @pytest.mark.parametrize("part", [slice(0, 3), slice(3, 6)])
 def test_a_twist_with_the_axes_of_the_world_is_found(robot, walk, part):
     t = walk.t
-    pose = np.array(
-        [
-            pin.SE3ToXYZQUAT(
-                pin.SE3(pin.rpy.rpyToMatrix(0.8, -0.5, 1.5 + 0.3 * np.sin(3 * x)),
-                        np.array([np.sin(x), np.cos(2 * x), 0.0]))
-            )
-            for x in t
-        ]
-    )  # fmt: skip
+    R = [pin.rpy.rpyToMatrix(0.8, -0.5, 1.5 + 0.3 * np.sin(3 * x)) for x in t]
+    p = np.column_stack([np.sin(t), np.cos(2 * t), 0.0 * t])
+    pose = np.array([pin.SE3ToXYZQUAT(pin.SE3(*x)) for x in zip(R, p, strict=True)])
     twist = base_state(t, pose, None, None)[1]
     right = replace(walk, base=BaseMotion(pose, twist), contacts={})
     free = replace(robot, constraints=())
@@ -137,3 +135,89 @@ def test_a_twist_with_the_axes_of_the_world_is_found(robot, walk, part):
     linear = np.sqrt(np.mean(np.sum(twist[:, :3] ** 2, axis=1)))  # m/s
     assert [other.evidence[x] for x in ("off", "size")] == pytest.approx([linear, linear])
     assert "Check the columns base_vx to base_wz, or remove them" in other.message
+
+
+# --- measured forces ------------------------------------------------------------------------------
+SLOW = SignalSettings(cutoff=4.0)
+FOUR, PARTS = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT"), ("fx", "fy", "fz")
+
+
+@pytest.fixture(scope="module")
+def stander():
+    contacts = [Contact(foot, measured=PARTS) for foot in FOUR]
+    return RobotModel.from_urdf(
+        example_urdf("solo12.urdf"), free_flyer=True, terms=(), constraints=contacts
+    )
+
+
+@pytest.fixture(scope="module")
+def steps(stander):
+    """Return a log with forces of a robot on its feet whose bodies differ from the URDF's."""
+    rng = np.random.default_rng(3)
+    other = with_other_bodies(stander, rng)
+    motion = stand(stander, np.tile([0.0, 0.8, -1.6], 4), 0.25, rng, parts=2)
+    return recorded(
+        other, other.standard_parameters(), motion, rng, rate=80.0, duration=6.0,
+        acceleration=False,
+    )  # fmt: skip
+
+
+def wrench_findings(model, steps):
+    return list(check_wrenches(model, steps.name, process(steps, SLOW)))
+
+
+def parts(model, steps):
+    """Return J^T f and W pi, shape (N, n_rows)."""
+    motion, whole = process(steps, SLOW), np.ones((1, len(FOUR)), dtype=bool)
+    torque = predict(replace(model, constraints=()), [model.standard_parameters()], motion)[0]
+    J = constraint_jacobian(model, motion.q, np.repeat(whole, len(motion.t), axis=0))
+    return np.einsum("kmj,km->kj", J, motion.wrenches), torque
+
+
+def unexplained(model, steps, factor=1.0):
+    """Return the RMS force of W pi - factor J^T f of the base."""
+    caused, torque = parts(model, steps)
+    return np.sqrt(np.mean(np.sum((torque - factor * caused)[:, :3] ** 2, axis=1)))
+
+
+def scaled(steps, factor):
+    return replace(steps, wrenches={x: factor * y for x, y in steps.wrenches.items()})
+
+
+def test_right_forces_have_no_finding(stander, steps):
+    assert not list(check_base(stander, steps, SLOW))
+
+
+@pytest.mark.parametrize(
+    ("size", "words", "factor"),
+    [
+        (-1.0, "their sign is reversed", -1.0),
+        (1e-3, "another unit, kN", 1e3),
+        (1 / 9.81, "another unit, kgf", 9.81),
+        (0.2, "another unit. Correct", 5.0),
+    ],
+)
+def test_a_fault_of_the_columns_is_named(stander, steps, size, words, factor):
+    wrong = scaled(steps, size)
+    (finding,) = wrench_findings(stander, wrong)
+    assert (finding.code, finding.severity) == ("measured_wrench", "error")
+    assert words in finding.message
+    assert finding.evidence["factor"] == pytest.approx(factor, rel=0.2)
+    assert finding.evidence["best"] < 0.3 * 2.5 * 9.81  # what masses of the URDF leave
+    assert finding.evidence["force"] == pytest.approx(unexplained(stander, wrong))
+    caused, left = (x[:, :6] for x in parts(stander, wrong))
+    if factor > 1.0:  # least squares of force and moment together
+        factor = np.sum(caused * left) / np.sum(caused**2)
+    assert finding.evidence["factor"] == pytest.approx(factor)
+    assert finding.evidence["best"] == pytest.approx(unexplained(stander, wrong, factor))
+
+
+def test_vertical_forces_alone_show_their_sign(stander, steps):
+    contacts = [Contact(foot, "point", ("fz",)) for foot in FOUR]
+    model = replace(stander, constraints=tuple(contacts))
+    vertical = replace(
+        steps, wrenches={f"fz {foot}": steps.wrenches[f"fz {foot}"] for foot in FOUR}
+    )
+    assert not wrench_findings(model, vertical)
+    (finding,) = wrench_findings(model, scaled(vertical, -1.0))
+    assert "their sign is reversed" in finding.message

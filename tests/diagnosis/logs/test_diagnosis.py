@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers.corruptions import CASES, NOISE, ROBOTS, clean_log, controlled_log, robot, table_of
 from helpers.driven import arm
+from helpers.paths import ROOT
 from helpers.synthetic import exact_log, perfect, truth
 
 from robotid.cli import main
@@ -15,14 +16,19 @@ from robotid.cli.doctor import doctor
 from robotid.cli.job import Job, LogEntry, read_job
 from robotid.cli.logs import examine
 from robotid.data.files.read import write_columns, write_log
+from robotid.data.log import REPEATED, Trajectory, repeated_share
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.logs.check_logs import diagnose, findings_to_dict
+from robotid.data.signals import process
+from robotid.diagnosis.logs.check_logs import check_excitation, diagnose, findings_to_dict
+from robotid.diagnosis.urdf.inspection import inspect_urdf
+from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Sensors
-from robotid.dynamics.simulation.simulator import simulate
-from robotid.dynamics.simulation.truth import another_robot
+from robotid.dynamics.simulation.simulator import another_robot, simulate
+from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
+from robotid.robot.prior import prior_spread
 
 JOBS = Path(__file__).parents[2] / "jobs"
 SIGNALS = SignalSettings()
@@ -147,7 +153,7 @@ def test_a_payload_is_weighed(ur5):
     assert abs(found.evidence["mass"] - 4.2) < 3 * found.evidence["std_error"]
 
 
-# ---- the recordings of other laboratories; of single traps see test_real_traps.py
+# ---- the recordings of other laboratories
 def whole(recordings, monkeypatch, name, *files):
     monkeypatch.setenv("ROBOTID_DATA", str(recordings))
     job = read_job(JOBS / f"{name}.toml")
@@ -295,3 +301,141 @@ def test_a_load_is_not_taken_for_another_gravity():
     # 1.2 kg in the hand of an arm of 0.6 kg
     model = RobotModel.from_urdf(example_urdf("so101.urdf"))
     assert "gravity" not in loud(diagnose(model, [clean_log(model, 0)], [], SIGNALS))
+
+
+# --- traps that the publishers of recordings warn of ----------------------------------------------
+# what the notes of each set say, and the finding with the figure that tells it
+TRAPS = {
+    "kinova_gen3/gen3_1.parquet": [
+        ("gap", "longest", 0.9, 1.0),  # slow samples were removed
+        ("jitter", "relative_spread", 0.16, 0.17),
+    ],
+    "kinova_gen3/gen3_2.parquet": [("gap", "gaps", 2, 4)],
+    "tx40/joint_side.parquet": [
+        ("rate", "rate", 4999, 5001),
+        ("standstill", "after", 1.2, 1.6),  # motion 0-7.45 s of 9, cut and trimmed by the settings
+    ],
+    "ur10e/ident_20200212_50s12h.parquet": [
+        ("standstill", "before", 2.0, 4.0),  # every file starts and ends at rest
+        ("standstill", "after", 3.0, 6.0),
+    ],
+    "tiago/tiago_dyn.parquet": [
+        ("velocity_delay", "delay", 0.13, 0.2),  # 140-190 ms, smoothed by the driver
+        ("quantised", "steps_arm_5_joint", 20, 60),  # wrist currents of a few quanta
+        ("quantised", "steps_arm_7_joint", 20, 60),
+        ("standstill", "before", 6.0, 10.0),  # about 9 s at rest, then slow
+        ("standstill", "after", 11.0, 13.0),
+        ("unexplained_torque", "share", 0.7, 0.8),  # of the last joint
+    ],
+    "panda/panda_inria.parquet": [
+        ("jitter", "longest", 0.0019, 0.009),  # 0.7-8.8 ms around 1 ms
+        ("stale_rows", "rows", 1000, 1300),  # 1255 repeated rows, those at rest among them
+        ("velocity_delay", "delay", 0.004, 0.008),  # about 6 ms
+        ("gap", "longest", 0.0085, 0.009),
+    ],
+}
+FOLDERS = {"panda": "panda_inria"}
+
+
+@pytest.mark.parametrize("file", TRAPS)
+def test_the_doctor_finds_the_traps_of_a_real_recording(recordings, monkeypatch, file):
+    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
+    folder = file.split("/", maxsplit=1)[0]
+    job = read_job(JOBS / f"{FOLDERS.get(folder, folder)}.toml")
+    model = job.model()
+    findings = diagnose(model, [job.read(LogEntry(recordings / file), model)], [], job.signals)
+    assert not [f.code for f in findings if f.severity == "error"]
+    for code, figure, low, high in TRAPS[file]:
+        values = [f.evidence[figure] for f in findings if f.code == code and figure in f.evidence]
+        assert any(low <= value <= high for value in values), (code, figure, values)
+
+
+def test_joints_that_turn_freely_but_are_stated_without_limits_are_named(recordings):
+    found = inspect_urdf(recordings / "kinova_gen3" / "robot.urdf").findings
+    joints = {f.where for f in found if f.code == "no_limits"}
+    assert joints == {f"joint joint_{k}" for k in (1, 3, 5, 7)}
+
+
+# --- repeated motions and excitation --------------------------------------------------------------
+EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+
+
+@pytest.fixture(scope="module")
+def planar():
+    return RobotModel.from_urdf(ROOT / "urdf" / "planar_2r.urdf")
+
+
+@pytest.fixture(scope="module")
+def motions(planar):
+    """Motions of 10 s at 100 Hz, one quicker than the other."""
+    rng = np.random.default_rng(1)
+    logs = [
+        exact_log(planar, truth(planar), rng, samples=n, rate=100.0, noise=[0.2, 0.05])
+        for n in (1000, 1000, 600)
+    ]
+    return [process(log, EXACT) for log in logs]
+
+
+def joined(first, second):
+    """Return the rows of two motions as segments of one."""
+    later = second.t - second.t[0] + first.t[-1] + 5.0
+    arrays = {k: np.vstack([getattr(first, k), getattr(second, k)]) for k in ("q", "v", "a", "tau")}
+    segment = np.repeat([0, 1], [len(first.t), len(second.t)])
+    t = np.append(first.t, later)
+    return Trajectory(t=t, joints=first.joints, rate=None, segment=segment, **arrays)
+
+
+def test_the_share_that_repeats_is_that_of_the_log_that_has_most_of_it(motions):
+    first, second, other = motions
+    kept = joined(first.at(slice(100, 600)), other)
+    # rows that go on for a second, 400 of the first segment and 500 of the second, and move in it
+    moved = [np.abs(part[100:] - part[:-100]) / np.ptp(kept.q, axis=0) > 0.04
+             for part in np.split(kept.q, [500])]  # fmt: skip
+    old, new = (part.any(axis=1).sum() for part in moved)
+    assert old == 400
+    for fitted in ([first, second], [second, first]):
+        assert repeated_share(fitted, kept) == pytest.approx(old / (old + new), abs=0.005)
+    assert repeated_share([second], kept) == 0.0
+    # 150 of 650 are less than three tenths
+    assert repeated_share([first], joined(first.at(slice(0, 250)), other)) < REPEATED
+
+
+def test_excitation_is_that_of_the_weighted_rows_of_all_motions(planar, motions):
+    mapping, two = structural_mapping(planar), motions[1:]
+    (found,) = check_excitation(planar, mapping, two, EXACT, "one, other")
+    Y = np.concatenate([joint_torque_regressor(planar, m.q, m.v, m.a) for m in two])
+    W = Y[:, mapping.independent].reshape(-1, 2, len(mapping.K))
+    tau, sigma = np.concatenate([m.tau for m in two]), np.ones(2)
+    for _ in range(30):
+        rows = (W / sigma[:, None]).reshape(-1, W.shape[2])
+        beta = np.linalg.lstsq(rows, (tau / sigma).ravel(), rcond=None)[0]
+        sigma = np.sqrt(np.mean((tau - W @ beta) ** 2, axis=0))
+    rows = (W / sigma[:, None]).reshape(-1, W.shape[2])
+    condition = np.linalg.cond(rows / np.linalg.norm(rows, axis=0))
+    assert found.evidence["condition"] == pytest.approx(condition, rel=2e-3)
+    # of the plausible spread of base parameters, what the rows leave of its largest sum
+    spread = prior_spread(planar, sum(m.squares for m in two), sum(len(m.t) for m in two))
+    L = np.linalg.cholesky(mapping.K @ np.diag(spread**2) @ mapping.K.T)
+    weakest = 1.0 / np.sqrt(1.0 + np.linalg.eigvalsh((rows @ L).T @ rows @ L)[0])
+    assert found.evidence["weakest"] == pytest.approx(weakest, rel=2e-3)
+    b = len(mapping.K)
+    assert (found.evidence["rank"], found.evidence["base"]) == (b, b)
+    assert found.severity == "note"
+    assert found.message.startswith(f"one, other: the motion determines {b} of {b} base parameters")
+    assert (
+        f"(condition number {found.evidence['condition']:.3g} of the regressor, unit columns); no "
+        "action needed" in found.message
+    )
+
+
+def test_the_excitation_by_a_joint_at_rest_is_checked_too(planar, motions):
+    """The rows determine fewer sums than there are base parameters."""
+    still = {name: getattr(motions[2], name) * [1.0, 0.0] for name in ("q", "v", "a")}
+    mapping, motion = structural_mapping(planar), replace(motions[2], **still)
+    (found,) = check_excitation(planar, mapping, [motion], EXACT, "one")
+    Y = joint_torque_regressor(planar, motion.q, motion.v, motion.a)[:, mapping.independent]
+    b = len(mapping.K)
+    assert (found.evidence["rank"], found.evidence["base"]) == (np.linalg.matrix_rank(Y), b)
+    assert found.evidence["rank"] < b
+    assert found.severity == "warning"
+    assert found.message.startswith("one: the motion determines 7 of 11 base parameters")

@@ -3,16 +3,29 @@
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
-from helpers.corruptions import clean_log, robot
+from helpers.corruptions import clean_log, controlled_log, late, robot, table_of
+from helpers.synthetic import exact_log, truth
 
 from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.logs import torque_delay
 from robotid.diagnosis.logs.check_logs import diagnose
-from robotid.diagnosis.logs.hypotheses import explanations, smooth_motion, take_probe
+from robotid.diagnosis.logs.hypotheses import (
+    Probe,
+    compensated,
+    coupled_columns,
+    explanations,
+    own_share,
+    smooth_motion,
+    take_probe,
+)
 from robotid.diagnosis.logs.torque_checks import load_model
+from robotid.dynamics.simulation.simulator import another_robot
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
+from robotid.robot.parameters import Coupling
 
 SIGNALS = SignalSettings()
 CODES = {"current_for_torque", "urdf_mismatch", "unexplained_torque"}
@@ -104,3 +117,207 @@ def test_the_fit_is_the_least_squares_of_all_joints_and_drives(ur5, ur5_log):
     assert chi == pytest.approx(np.sum((A / size @ found - b) ** 2), rel=1e-6)
     covariance = np.linalg.inv((A / size).T @ (A / size)) / np.outer(size, size)
     np.testing.assert_allclose(error, np.sqrt(np.diag(covariance))[:10], rtol=1e-4)
+
+
+# --- loads of validation logs alone ---------------------------------------------------------------
+CHANGES = {"payload_change", "payload"}
+
+
+def changes(model, fitted, kept=()):
+    found = diagnose(model, [fitted], list(kept), SignalSettings())
+    return [f for f in found if f.code in CHANGES and f.severity != "note"]
+
+
+def test_a_load_in_the_validation_log_only_is_weighed(arm_and_log):
+    model, fitted, other = arm_and_log
+    size, pi = model.layout.n_inertial, another_robot(model, np.random.default_rng(0))
+    assert changes(model, fitted, [other]) == []
+    loaded = pi.copy()
+    last = loaded[:size].reshape(-1, 10)[-1]
+    last += np.array([1, 0, 0.05, 0.1, 0.02, 0, 0.02, 0, 0, 0.02])
+    kept = clean_log(model, 2, pi=loaded, rate=50.0, duration=10.0)
+    (change,) = [f for f in changes(model, fitted, [kept]) if f.code == "payload_change"]
+    assert change.where == f"run.csv: {model.layout.bodies[-1]}"
+    assert change.evidence["mass"] == pytest.approx(1.0, abs=3 * change.evidence["std_error"])
+    assert change.evidence["std_error"] < 0.05
+    assert " kg more than in the fitted logs" in change.message
+    (change,) = [f for f in changes(model, kept, [fitted]) if f.code == "payload_change"]
+    assert change.evidence["mass"] == pytest.approx(-1.0, abs=3 * change.evidence["std_error"])
+    assert " kg less than in the fitted logs" in change.message
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda log: replace(log, tau=1.05 * log.tau),
+        lambda log: replace(log, tau=log.tau * [1, 1, 1, 1.5, 1.5, 1.5]),
+        lambda log: replace(log, tau=log.tau * [1, 1, -1, 1, 1, 1]),
+        lambda log: replace(log, q=log.q + 0.05 * np.eye(6)[2]),
+    ],
+    ids=["all torques x 1.05", "wrist torques x 1.5", "elbow reversed", "elbow zero moved"],
+)
+def test_what_else_makes_a_validation_log_another_one_is_no_load(arm_and_log, change):
+    model, fitted, other = arm_and_log
+    assert "payload_change" not in [f.code for f in changes(model, fitted, [change(other)])]
+
+
+@pytest.fixture(scope="module")
+def arm_and_log():
+    model = robot("ur5")
+    pi = another_robot(model, np.random.default_rng(0))
+    return model, *(clean_log(model, seed, pi=pi, rate=50.0, duration=10.0) for seed in (0, 1))
+
+
+def test_a_load_is_named_beside_a_urdf_of_another_robot(arm_and_log):
+    """Links that weigh half or twice what the URDF says are no reason to miss a load."""
+    model, *_ = arm_and_log
+    rng = np.random.default_rng(4)
+    size, pi = model.layout.n_inertial, another_robot(model, rng)
+    links = pi[:size].reshape(-1, 10)
+    links *= rng.choice([0.5, 2.0], (len(links), 1))
+    loaded = pi.copy()
+    loaded[:size].reshape(-1, 10)[-1] += [1, 0.03, 0.02, 0.06, 0.006, 0, 0.006, 0, 0, 0.003]
+    fitted, kept = (
+        clean_log(model, seed, pi=x, rate=50.0, duration=10.0) for seed, x in ((5, pi), (6, loaded))
+    )
+    (change,) = [f for f in changes(model, fitted, [kept]) if f.code == "payload_change"]
+    mass, error = change.evidence["mass"], change.evidence["std_error"]
+    assert mass == pytest.approx(1.0, abs=4 * error)
+    assert error < 0.05
+
+
+# --- probes ---------------------------------------------------------------------------------------
+def test_columns_of_coupled_drives_are_those_of_the_regressor(ur5, rng):
+    coupling = Coupling("motor", (("wrist_2_joint", 1.0), ("wrist_3_joint", -2.0)))
+    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), couplings=(coupling,))
+    q, v, a = rng.uniform(-2, 2, (3, 20, 6))
+    chosen = model.layout.n_inertial + np.flatnonzero(model.layout.is_coupled)
+    Y = joint_torque_regressor(model, q, v, a).reshape(20, 6, -1)
+    found = coupled_columns(model, q, v, a)
+    np.testing.assert_array_equal(found, Y[:, :, chosen])
+    assert found.any(axis=0)[[4, 5]].all()  # a load of both joints
+    assert coupled_columns(ur5, q, v, a).shape == (20, 6, 0)
+
+
+@pytest.fixture(scope="module")
+def probe():
+    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"))
+    motion = smooth_motion(model, clean_log(model, 0, duration=3.0), SignalSettings())
+    return take_probe(model, motion, samples=60)
+
+
+def test_a_probe_at_other_rows_is_of_the_same_motion(probe):
+    other = Probe.of(probe.model, probe.motion, probe.rows[3:40:5])
+    for key in ("q", "v", "a", "tau"):
+        np.testing.assert_array_equal(getattr(other, key), getattr(probe, key)[3:40:5])
+    np.testing.assert_allclose(other.loads(), probe.loads()[3:40:5], atol=1e-12)
+    t = probe.motion.t  # the filter settles at both ends
+    inner = np.flatnonzero((t > t[0] + 0.149) & (t < t[-1] - 0.149))
+    assert [probe.rows[0], probe.rows[-1]] == [inner[0], inner[-1]]
+
+
+def test_torques_without_gravity_are_judged_by_their_own_size(probe, rng):
+    robot = probe.model.pin_model
+    data = robot.createData()
+    weight = np.array([pin.computeGeneralizedGravity(robot, data, q) for q in probe.q])
+    noise = 0.5 * weight.std(axis=0).clip(1e-3) * rng.standard_normal(weight.shape)
+    logged = replace(probe, tau=noise - 0.8 * weight)
+    whole, left = compensated(logged)
+    np.testing.assert_allclose(whole.tau, logged.tau + weight, atol=1e-9)
+    size = np.var(whole.tau, axis=0) / np.var(logged.tau, axis=0)
+    wanted = np.minimum(own_share(whole) * size, 1.0)
+    np.testing.assert_allclose(left, wanted, rtol=1e-6)
+    assert np.abs(size - 1.0).max() > 0.3
+
+
+def test_the_sign_of_a_slow_joint_turns_within_a_twentieth_of_its_own_speed(probe):
+    v = probe.v / np.abs(probe.v).max(axis=0) * [2.0, 0.1, 0.3, 0.5, 0.0, 1.0]
+    still = [0.02, 0.005, 0.015, 0.02, 0.02, 0.02]
+    found = replace(probe, v=v).drives
+    np.testing.assert_allclose(found[:, :, 2], np.tanh(v / still), rtol=1e-12)
+    np.testing.assert_array_equal(found[:, :, 1], v)
+
+
+# --- delays of the torque -------------------------------------------------------------------------
+# robot, seed, duration [s]: logs whose every torque the filter alone makes look late or early
+CLEAN = [("ur5", 100, 8.0), ("ur5", 101, 8.0), ("ur5", 104, 6.0), ("panda", 100, 6.0)]
+
+
+def found(model, log, signals=SIGNALS):
+    return list(torque_delay.check_torque_delay(model, log, signals, "run.csv"))
+
+
+def delayed(log, delay):
+    table = late("tau_", delay)(table_of(log))
+    return replace(log, tau=np.column_stack([table[f"tau_{joint}"] for joint in log.joints]))
+
+
+@pytest.mark.parametrize(("name", "seed", "duration"), CLEAN)
+def test_a_short_clean_log_has_no_late_torque_but_a_delayed_one_has(name, seed, duration):
+    model, log = robot(name), controlled_log(name, seed, duration=duration)
+    (clean,) = found(model, log)
+    assert clean.severity == "note"
+    # without the filter on the regressor 6 to 9 ms and 11 to 15 %
+    assert abs(clean.evidence["delay"]) < 0.006
+    assert clean.evidence["gain"] < 0.09
+    for delay in (0.03, -0.03):
+        (spoilt,) = found(model, delayed(log, delay))
+        assert spoilt.severity == "warning"
+        # what was found of the clean log is the bias of the method
+        assert spoilt.evidence["delay"] - clean.evidence["delay"] == pytest.approx(delay, abs=2e-3)
+        assert spoilt.evidence["gain"] > 0.25
+
+
+def test_a_log_without_a_filter_is_judged_too(ur5):
+    signals = replace(SIGNALS, cutoff=None)
+    log = exact_log(ur5, truth(ur5), np.random.default_rng(0), samples=800, rate=100.0)
+    (clean,) = found(ur5, log, signals)
+    (spoilt,) = found(ur5, delayed(log, 0.03), signals)
+    assert (clean.severity, spoilt.severity) == ("note", "warning")
+
+
+def test_noise_of_a_log_without_a_filter_is_no_delay(ur5):
+    # half-way between rows a spline of white noise is a quarter smaller: 10 ms here
+    log = exact_log(ur5, truth(ur5), np.random.default_rng(1), samples=600, rate=50.0)
+    log = replace(log, tau=log.tau + 0.1 * np.random.default_rng(1).standard_normal(log.tau.shape))
+    (clean,) = found(ur5, log, replace(SIGNALS, cutoff=None, trim=0.0))
+    assert clean.severity == "note"
+    assert abs(clean.evidence["delay"]) < 0.005
+    assert clean.evidence["gain"] < 0.05
+
+
+def test_all_rows_from_the_first_to_the_last_that_moves_are_used(ur5):
+    motion = smooth_motion(ur5, clean_log(ur5, 100, duration=8.0), SIGNALS)
+    v = motion.v.copy()
+    v[:40] = v[-30:] = 0.0
+    (rows,) = torque_delay._segments(ur5, replace(motion, v=v), 1)
+    np.testing.assert_array_equal(rows, np.arange(40, len(v) - 30))
+
+
+def test_joints_that_hardly_move_have_no_say(ur5):
+    log = clean_log(ur5, 100, duration=20.0)
+    still = np.abs(log.t - 8.5) > 0.95
+    q = log.q.copy()
+    q[still, :5] = q[850, :5]
+    assert found(ur5, replace(log, q=q)) == []
+
+
+@pytest.mark.parametrize(("name", "seed"), [("ur5", 100), ("ur5", 102), ("panda", 104)])
+def test_a_torque_that_is_periodic_in_the_position_is_no_delay(name, seed):
+    model = robot(name)
+    log, rng = clean_log(model, seed), np.random.default_rng(seed)
+    tau = log.tau.copy()
+    for torque, q in zip(tau.T, log.q.T, strict=True):
+        phase, size = rng.uniform(0, 2 * np.pi, 4), rng.standard_normal(4)
+        waves = [np.cos(k * q + p) for k, p in zip((1, 2, 3, 4), phase, strict=True)]
+        ripple = size @ waves
+        torque += 0.3 * torque.std() * ripple / ripple.std()
+    for finding in found(model, replace(log, tau=tau)):
+        assert finding.severity == "note"
+
+
+def test_a_model_of_one_joint_is_not_judged():
+    whole = robot("ur5")
+    log = clean_log(whole, 100, duration=8.0)
+    model = RobotModel.from_urdf(whole.tree.path, joints=["elbow_joint"])
+    assert found(model, log.select(["elbow_joint"])) == []

@@ -15,7 +15,7 @@ from robotid.diagnosis.residual.discrepancies import alterations, explain_residu
 from robotid.diagnosis.residual.misfit import find_misfits
 from robotid.diagnosis.residual.term_trials import take_sample
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.prediction import inverse_dynamics
+from robotid.dynamics.torque import inverse_dynamics
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.identification.pipeline import with_drives

@@ -24,8 +24,7 @@ from robotid.diagnosis.residual.torque_split import (
     joint_torques,
     split_torque,
 )
-from robotid.dynamics.prediction import predict, remember
-from robotid.dynamics.torque import joint_torque_regressor
+from robotid.dynamics.torque import joint_torque_regressor, predict, remember
 from robotid.estimation.fitting.evaluation import evaluate_logs
 from robotid.estimation.fitting.recorded import hold_log
 from robotid.robot.drives import Harmonic, Hat, Lag, LoadFriction, Presliding, Spring, Stribeck
@@ -318,7 +317,6 @@ def test_a_residual_is_examined_without_outliers_of_the_samples_used(rng):
 
 
 # --- how a residual follows a quantity, against sums over rows, bins and segments one by one ----
-
 B, K, SIZE = 4, 7, 33  # bins, segments, rows of each
 
 
@@ -417,8 +415,6 @@ def test_even_bins_have_as_many_rows_and_are_cut_at_zero(rng):
 
 
 # --- friction against the truth -----------------------------------------------------------------
-
-
 def test_friction_is_the_torque_that_viscous_coulomb_and_offset_add(ur5, rng):
     pi = truth(ur5)
     log = hold_log(ur5, exact_log(ur5, pi, rng), SignalSettings(cutoff=None))

@@ -12,10 +12,15 @@ from robotid.diagnosis.verdict.verdict import (
     is_beaten,
     is_downweighted,
     judge,
+    judge_positions,
     rejected,
+    uses_line,
+    uses_of_motion,
+    uses_of_torques,
     warnings_of,
 )
 from robotid.estimation.fitting.evaluation import JointMetrics, Metrics
+from robotid.identification.summary import verdict_lines
 
 JOINTS = ("a", "b", "c")
 
@@ -55,27 +60,26 @@ def verdict(validation, fitted=None, **open):
     return judged(fit, logs, **open)
 
 
-def test_good_needs_every_joint_good_on_kept_recordings():
-    found = verdict({"a": joint(4.0)})
-    assert found.status == "good"
-    assert "on validation logs: at most 4.0 % at every joint" in found.reasons[0]
-
-
-def test_not_evaluated_is_never_a_pass():
-    found = verdict(None)
-    assert found.status == "usable"
-    assert "not evaluated: no validation log given" in found.reasons[0]
-    found = verdict({"a": joint(4.0)}, fitted={"a": joint(3.0), "b": joint(3.0)})
-    assert found.status == "usable"
-    assert found.reasons == ("the joints b do not move in any validation log: not evaluated",)
-
-
-def test_worse_than_a_constant_is_said_first():
-    found = verdict({"a": joint(20.0), "b": joint(40.0, constant=False)})
-    assert found.status == "poor"
-    assert found.reasons[0] == (
-        "b: worse than a constant torque on val.csv: error 40.0 %; a constant would give 33.3 %"
-    )
+@pytest.mark.parametrize(
+    ("validation", "fitted", "status", "reason"),
+    [
+        ({"a": joint(4.0)}, None, "good", "on validation logs: at most 4.0 % at every joint"),
+        (None, None, "usable", "not evaluated: no validation log given"),
+        ({"a": joint(4.0)}, {"a": joint(3.0), "b": joint(3.0)}, "usable",
+         "the joints b do not move in any validation log: not evaluated"),
+        ({"a": joint(20.0), "b": joint(40.0, constant=False)}, None, "poor",
+         "b: worse than a constant torque on val.csv: error 40.0 %; a constant would give 33.3 %"),
+        ({"a": joint(None, constant=False)}, None, "poor",
+         "a: the torque is 0 throughout val.csv: not evaluated. If the joint has no drive, state "
+         'passive = ["a"] in the job file'),
+        ({"a": joint(4.0, urdf=4.0)}, None, "good", "at most 4.0 % at every joint"),
+        ({"a": joint(4.1, urdf=4.0)}, None, "poor", "4.1 % on val.csv, worse than the URDF's 4.0"),
+    ],
+)  # fmt: skip
+def test_the_worst_reason_is_said_first(validation, fitted, status, reason):
+    found = verdict(validation, fitted)
+    assert found.status == status
+    assert reason in found.reasons[0]
 
 
 def test_alarms_come_before_everything_and_constants_before_the_rest():
@@ -138,14 +142,9 @@ def test_a_doubt_makes_its_joint_and_the_whole_usable_at_best():
     assert found.status == "usable"
     assert found.reasons == ("run.csv: masses do not fit (urdf_mismatch)",)
     assert {v.status for v in found.joints.values()} == {"usable"}
-    assert found.to_dict()["warnings"] == [
-        {
-            "code": "urdf_mismatch",
-            "joint": "",
-            "message": "run.csv: masses do not fit",
-            "effect": "usable",
-        }
-    ]
+    (warning,) = found.to_dict()["warnings"]
+    assert [*warning] == ["code", "joint", "message", "effect"]
+    assert [*warning.values()] == ["urdf_mismatch", "", "run.csv: masses do not fit", "usable"]
 
 
 @pytest.mark.parametrize("code", ["com_outside", "dense_body", "density", "ellipsoid", "gyration"])
@@ -157,15 +156,6 @@ def test_an_impossible_body_makes_the_result_usable_and_no_joint(code):
     assert concluded.status == "usable"
     assert concluded.reasons == (f"the mass of a is 40 kg: not possible ({code})",)
     assert {own.status for own in concluded.joints.values()} == {"good"}
-
-
-def test_a_torque_of_zero_is_no_prediction():
-    found = verdict({"a": joint(None, constant=False)})
-    assert found.status == "poor"
-    assert found.reasons == (
-        "a: the torque is 0 throughout val.csv: not evaluated. If the joint has no drive, state "
-        'passive = ["a"] in the job file',
-    )
 
 
 @pytest.mark.parametrize(
@@ -185,11 +175,6 @@ def test_each_threshold_lies_where_it_is_stated(error, fitted, status):
     found = verdict({"a": joint(error)}, fitted={"a": joint(fitted)})
     assert found.status == status
     assert found.joints["a"].status == status
-
-
-def test_an_error_equal_to_the_urdfs_is_not_worse_than_it():
-    assert verdict({"a": joint(4.0, urdf=4.0)}).status == "good"
-    assert verdict({"a": joint(4.1, urdf=4.0)}).status == "poor"
 
 
 @pytest.mark.parametrize(
@@ -335,3 +320,145 @@ def test_joints_better_by_the_urdf_are_those_of_all_logs():
     assert {log: [*own] for log, own in part.tested.items()} == {"one": ["a", "c"], "two": ["a"]}
     assert part.on_each().keys() == {"a", "c", "d"}
     assert part.better_by_urdf()[0].startswith("the URDF with fitted drives predicts a better")
+
+
+# --- uses -----------------------------------------------------------------------------------------
+VERIFIED = ScaleCheck({"a": 1.0, "b": 1.0}, scale=1.0, factor=1.0, masses=(20.0, 20.0, 0.0))
+OPEN = ScaleCheck({"a": 1.2, "b": 1.2}, scale=1.2, factor=1.2, masses=(20.0, 24.0, 0.0))
+WRONG = ScaleCheck({"a": 2.0}, scale=2.0, factor=2.0, masses=(20.0, 40.0, 0.0))
+SCALE = "yes, torque scale not verified"
+
+
+def uses(*statuses, scale_check=VERIFIED, **changes):
+    """Return the three uses of a result with joints a, b, c."""
+    stated = {"is_consistent": True, "is_static": False, "log_errors": ()} | changes
+    joints = dict(zip("abc", statuses, strict=False))
+    return tuple(uses_of_torques(joints, scale_check=scale_check, **stated).values())
+
+
+@pytest.mark.parametrize(
+    ("statuses", "scale_check", "changes", "wanted"),
+    [
+        (("good",) * 3, VERIFIED, {}, ("yes", "yes", "yes")),
+        (("good",) * 3, OPEN, {}, ("yes", SCALE, SCALE)),
+        (("good",) * 3, None, {}, ("yes", SCALE, "no, no joint determines its gravity")),
+        (("good",) * 3, WRONG, {}, ("yes", *["no, the torque scale is contradicted"] * 2)),
+        (("good", "usable", "good"), VERIFIED, {}, ("yes, with the warnings",) * 3),
+        # gravity loads a and b only
+        (("good", "good", "poor"), VERIFIED, {},
+         ("yes, without c", "no, torques of c are poor", "yes")),
+        (("poor", "good", "good"), VERIFIED, {},
+         ("yes, without a", "no, torques of a are poor", "yes, without a")),
+        (("poor",) * 3, VERIFIED, {},
+         ("no, the errors on validation logs are large", "no, torques of a, b, c are poor",
+          "no, the errors on validation logs are large")),
+        (("not evaluated",) * 3, VERIFIED, {}, ("not verified, no validation log",) * 3),
+        (("good",) * 3, VERIFIED, {"is_consistent": False},
+         ("yes", "no, not physically consistent", "yes")),
+        (("good",) * 3, VERIFIED, {"is_static": True},
+         ("yes, at rest and in slow motion", "no, inertias are the URDF's", "yes")),
+        (("good",) * 3, VERIFIED, {"log_errors": ("x",)}, ("no, errors of the recordings",) * 3),
+    ],
+)  # fmt: skip
+def test_uses_follow_from_joints_consistency_and_scale(statuses, scale_check, changes, wanted):
+    assert uses(*statuses, scale_check=scale_check, **changes) == wanted
+
+
+def test_the_scale_of_positions_comes_from_a_torque_only():
+    joints = {"a": "good", "b": "not evaluated"}
+    found = uses_of_motion(joints, log_errors=(), is_scaled=False)
+    assert [*found.values()] == [
+        "yes, without b (not evaluated)",
+        "yes, without b (not evaluated), scale not verified by a torque",
+        "no, it needs a result from logged torques",
+    ]
+    scaled = uses_of_motion({"a": "good"}, log_errors=(), is_scaled=True)
+    assert uses_line(scaled) == (
+        "use for: simulation of drives and controllers: yes; torque feed-forward: yes; "
+        "payload estimation: no, it needs a result from logged torques"
+    )
+    wrong = uses_of_motion({"a": "good"}, log_errors=("x",), is_scaled=True)
+    assert {*wrong.values()} == {
+        "no, errors of the recordings", "no, it needs a result from logged torques",
+    }  # fmt: skip
+    assert uses_line({}) == ""
+
+
+# --- simulated positions --------------------------------------------------------------------------
+def judged_positions(errors, is_validation=True, joints=("a", "b"), **known):
+    """Return the verdict on joints by their errors [%], or by errors with baselines."""
+    per_joint = {}
+    for name, own in errors.items():
+        error, baselines = own if isinstance(own, tuple) else (own, {})
+        per_joint[name] = JointMetrics(1e-3, "rad", error, 0.9, 100, baselines, True)
+    return judge_positions(Metrics(per_joint, 1e-3), joints, is_validation=is_validation, **known)
+
+
+def statuses(found):
+    return {joint: verdict.status for joint, verdict in found.joints.items()}
+
+
+def test_the_worst_joint_decides_by_the_thresholds():
+    good = judged_positions({"a": 2.0, "b": 5.0})
+    assert good.status == "good"
+    assert good.reasons == (
+        "simulated position error on validation logs: at most 5 % of each joint's RMS motion, "
+        "smaller than those of simpler models",
+    )
+    usable = judged_positions({"a": 5.1, "b": 2.0})
+    assert (usable.status, statuses(usable)) == ("usable", {"a": "usable", "b": "good"})
+    assert usable.reasons == ("a: simulated position error 5.1 % of its RMS motion",)
+    assert judged_positions({"a": 30.0, "b": 2.0}).status == "usable"
+    poor = judged_positions({"a": 5.1, "b": 30.1})
+    assert (poor.status, statuses(poor)) == ("poor", {"a": "usable", "b": "poor"})
+    assert [reason[0] for reason in poor.reasons] == ["b", "a"], "the worst first"
+
+
+def test_a_plainer_model_that_is_better_keeps_it_from_being_good_and_the_command_makes_it_poor():
+    others = {"command": 50.0, "urdf": None, "second_order": 1.9}
+    near = judged_positions({"a": (1.99, others), "b": 1.0})
+    assert near.status == "good", "within a twentieth"
+    beaten = judged_positions({"a": (2.0, others), "b": 1.0})
+    assert statuses(beaten) == {"a": "usable", "b": "good"}
+    assert beaten.reasons[0].endswith("2 % of its RMS motion; smaller with a second-order model")
+    worse = judged_positions({"a": (2.0, others | {"command": 1.0}), "b": 1.0})
+    assert worse.status == "poor"
+    driven = judged_positions({"a": (2.0, {"urdf": 1.0, "rows": 3.0, "steady": 40.0}), "b": 1.0})
+    assert "smaller with the URDF with fitted drives" in driven.reasons[0]
+    stated = judged_positions({"a": (2.0, {"urdf": 1.0, "command": 40.0}), "b": 1.0})
+    assert "smaller with the URDF with the stated gains" in stated.reasons[0]
+
+
+def test_what_no_log_tests_is_not_evaluated():
+    fitted = judged_positions({"a": 2.0, "b": 60.0}, is_validation=False)
+    assert fitted.status == "not evaluated"
+    assert statuses(fitted) == {"a": "not evaluated", "b": "not evaluated"}
+    assert fitted.reasons[0].endswith("no validation log given")
+    still = judged_positions({"a": 2.0})
+    assert (still.status, statuses(still)) == ("usable", {"a": "good", "b": "not evaluated"})
+    assert still.reasons == ("b: commanded to rest in all logs: not evaluated",)
+    assert judged_positions({}).status == "not evaluated"
+
+
+def test_faults_and_cautions_come_first_and_the_scale_last():
+    errors = {"a": 2.0, "b": 2.0}
+    unsettled = judged_positions(errors, is_settled=False, scale="the scale depends on kp")
+    assert unsettled.status == "usable"
+    assert unsettled.reasons == ("the fit has not converged", "the scale depends on kp")
+    assert judged_positions(errors, scale="the scale depends on kp").status == "good"
+    doubtful = judged_positions(errors, is_settled=False, cautions=["at its bound"])
+    assert doubtful.reasons == ("at its bound", "the fit has not converged")
+    wrong = judged_positions(
+        {"a": 2.0, "b": 9.0}, log_errors=["the clock jumps"], cautions=["at its bound"]
+    )
+    assert wrong.status == "poor"
+    assert wrong.log_errors == ("the clock jumps",)
+    assert [reason[:5] for reason in wrong.reasons] == ["the c", "at it", "b: si"]
+
+
+def test_the_largest_error_is_the_first_reason():
+    errors = {"a": 8.0, "b": 45.0, "c": 70.0, "d": 12.0}
+    found = judged_positions(errors, joints=tuple(errors))
+    assert [reason[0] for reason in found.reasons] == ["c", "b", "d", "a"]
+    lines = verdict_lines(found.to_dict())
+    assert [line.split()[0] for line in lines] == ["verdict:", "c:", "b:", "d:", "a:", "use"]

@@ -4,9 +4,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from robotid.dynamics.compiled import flatten
 from robotid.dynamics.kernels import lanes, tree_lanes
 from robotid.dynamics.kernels.lanes import LANES
+from robotid.dynamics.rows import flatten
 from robotid.robot.model import RobotModel
 
 LINK = (

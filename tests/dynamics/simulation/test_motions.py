@@ -5,6 +5,7 @@ import pytest
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.dynamics.simulation.motions import (
+    FourierTrajectory,
     ProgramMotion,
     SampledMotion,
     random_fourier,
@@ -18,14 +19,22 @@ def test_a_motion_of_seven_joints_has_the_coefficients_of_equation_28():
     np.testing.assert_allclose(ProgramMotion(A, T, q0).evaluate(t)[0], q0 + A * shape, rtol=1e-14)
 
 
-def test_its_derivatives_match_finite_differences():
-    motion, h = ProgramMotion(np.array([1.0, -2.0, 0.5]), 1.7), 1e-5
-    t = np.linspace(0.1, 1.6, 31)
-    _, v, a = motion.evaluate(t)
+WAVES = np.random.default_rng(0).standard_normal((2, 3, 3))
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [ProgramMotion(np.array([1.0, -2.0, 0.5]), 1.7), FourierTrajectory(np.ones(3), *WAVES, 4.0)],
+)
+def test_derivatives_match_finite_differences(motion):
+    t, h = np.linspace(0.1, 1.6, 31), 1e-5
+    q, v, a = motion.evaluate(t)
     (q0, v0, _), (q1, v1, _) = motion.evaluate(t - h), motion.evaluate(t + h)
-    # rounding 1e-16 / h and truncation h^2 are both near 1e-10
+    # rounding 1e-16 / h and truncation h^2 are both near 1e-10 of the Fourier motion's 100 rad/s^3
     np.testing.assert_allclose((q1 - q0) / (2 * h), v, atol=1e-8)
-    np.testing.assert_allclose((v1 - v0) / (2 * h), a, atol=1e-8)
+    np.testing.assert_allclose((v1 - v0) / (2 * h), a, atol=1e-7)
+    if isinstance(motion, FourierTrajectory):
+        np.testing.assert_allclose(motion.evaluate(t + 4.0)[0], q, atol=1e-12)
 
 
 def test_many_motions_at_once_are_the_motions_one_by_one(rng):

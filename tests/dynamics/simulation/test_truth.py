@@ -9,47 +9,43 @@ from scipy.linalg import eigvalsh
 
 from robotid.base.exceptions import ModelError, SettingsError
 from robotid.dynamics.simulation.simulation_settings import Truth
-from robotid.dynamics.simulation.truth import draw_parameters, perturbed_bodies
+from robotid.dynamics.simulation.simulator import draw_parameters, perturbed_bodies
 from robotid.robot.drives import LoadFriction
-from robotid.robot.parameters import pseudo_inertia
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import Coupling, pseudo_inertia
 
 
 def distances(model, pi):
     """Return d^2 = 1/2 sum log^2 of the eigenvalues of J^-1 J', per body."""
     size = model.layout.n_inertial
-    pairs = zip(
-        pseudo_inertia(pi[:size]), pseudo_inertia(model.standard_parameters()[:size]), strict=True
-    )
+    bodies = (pseudo_inertia(x[:size]) for x in (pi, model.standard_parameters()))
+    pairs = zip(*bodies, strict=True)
     return np.array([0.5 * np.sum(np.log(eigvalsh(new, old)) ** 2) for new, old in pairs])
 
 
 @pytest.mark.parametrize("size", [0.02, 0.1, 1.0])
 def test_bodies_lie_as_far_in_the_metric_as_was_asked(panda, rng, size):
-    squares = np.concatenate(
-        [distances(panda, perturbed_bodies(panda, size, rng)) for _ in range(60)]
-    )
+    draws = (perturbed_bodies(panda, size, rng) for _ in range(60))
+    squares = np.concatenate([distances(panda, draw) for draw in draws])
     # ten independent squares of one standard deviation: mean 10, standard deviation sqrt(20)
     assert np.mean(squares) / size**2 == pytest.approx(10.0, abs=4 * np.sqrt(20 / len(squares)))
     assert np.std(squares) / size**2 == pytest.approx(np.sqrt(20), rel=0.25)
 
 
-def test_wild_draws_are_possible_bodies(ur5, rng):
-    for _ in range(20):
-        J = pseudo_inertia(perturbed_bodies(ur5, 3.0, rng))
-        values = np.linalg.eigvalsh(J)
-        assert (values[:, 0] > -1e-12 * values[:, -1]).all()
-
-
-def test_drives_are_usual_for_the_size_of_their_joint(ur5, panda):
-    model = panda.with_terms({"panda_joint1": (LoadFriction(),)})
-    pi = draw_parameters(model, Truth(), np.random.default_rng(3))
-    effort = {joint.name: joint.effort for joint in model.limits}
-    assert effort["panda_joint7"] == 12.0
-    entries = zip(model.layout.drive_parameters, pi[model.layout.n_inertial :], strict=True)
-    for (d, term), value in entries:
-        size = min(1.0, effort[model.joints[d]] / 50.0) if term.name != "load" else 1.0
-        low, high = term.typical
-        assert size * low <= value <= size * high
+def test_drives_are_usual_for_the_size_of_their_weakest_joint(ur5, panda):
+    for ratios in ((("panda_joint1", 1.0), ("panda_joint7", 2.0)),
+                   (("panda_joint7", 2.0), ("panda_joint1", 1.0))):  # fmt: skip
+        model = RobotModel.from_urdf(
+            panda.tree.path, joints=panda.joints, couplings=(Coupling("motor", ratios),),
+            own_terms={"panda_joint1": (LoadFriction(),)},
+        )  # fmt: skip
+        pi = draw_parameters(model, Truth(inertials=0.0), np.random.default_rng(3))
+        drawn = dict(zip(model.layout.names, pi, strict=True))
+        for d, term in model.layout.drive_parameters:
+            drive = model.layout.drives[d].name  # joints 5 to 7 have 12 of the usual 50 N m
+            is_weak = term.name != "load" and (drive == "motor" or drive[-1] in "567")
+            low, high = (12.0 / 50.0 * x if is_weak else x for x in term.typical)
+            assert low <= drawn[f"{drive}.{term.name}"] <= high, drive
     none = draw_parameters(ur5, Truth(drives="none", inertials=0.0), np.random.default_rng(3))
     np.testing.assert_array_equal(none, ur5.standard_parameters())
 

@@ -1,15 +1,13 @@
 """Laws that every estimator obeys, and what an estimate and the scatter of segments state."""
 
 from dataclasses import fields, replace
-from functools import partial
 
 import numpy as np
 import pytest
-from helpers.driven import arm
 from helpers.estimation import ESTIMATORS, NOISE, Case, RandomStates
 
 from robotid.base.exceptions import DataError
-from robotid.dynamics.factors import Factors, compress, triangle_of
+from robotid.dynamics.factors import compress
 from robotid.estimation.estimators import (
     OLS,
     RLS,
@@ -20,13 +18,11 @@ from robotid.estimation.estimators import (
     NormalisedGradient,
     fold,
 )
-from robotid.estimation.estimators.estimator import scatter
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
 BATCH = ("ols", "wls", "tls", "consistent")
 RECURSIVE = tuple(name for name in ESTIMATORS if name not in BATCH)
-EXACT_COVARIANCE = ("ols", "wls", "consistent", "rls", "kalman")
 
 
 def makers(names):
@@ -60,32 +56,6 @@ def test_fewer_rows_than_parameters_are_refused(make, ur5, rng):
     case = Case(ur5, rng, samples=9)
     with pytest.raises(DataError, match=r"54 torque rows for 58 parameters: too few rows to fit"):
         make(case).fit(case.problem)
-
-
-@pytest.fixture(scope="module")
-def noisy():
-    """A case, and 60 problems whose torques differ by their noise alone."""
-    rng, noise = np.random.default_rng(0), NOISE[1:4]
-    case = Case(arm(), rng, np.zeros(3), samples=150)
-    case.sigma, problem = noise, case.problem
-    W, tau, weight = (np.concatenate(x) for x in zip(*problem.blocks(), strict=True))
-    torques = [tau + (noise * rng.standard_normal((150, 3))).ravel() for _ in range(60)]
-    blocks = ([(W, torque, weight)] for torque in torques)
-    return case, [replace(problem, stream=partial(iter, block), sources=()) for block in blocks]
-
-
-@makers(EXACT_COVARIANCE)
-def test_standard_errors_match_monte_carlo(make, noisy):
-    case, problems = noisy
-    estimates, stated = [], []
-    for problem in problems:
-        estimate = make(case).fit(problem)
-        estimates.append(case.base(estimate))
-        stated.append(np.sqrt(np.diag(case.covariance(estimate))))
-    ratio = np.mean(stated, axis=0) / np.std(estimates, axis=0, ddof=1)
-    # 60 runs know a standard deviation to 9 %; constraints and prior only make the fit tighter
-    assert 0.9 < np.median(ratio) < 1.6
-    assert ratio.min() > 0.65
 
 
 def started(make, case):
@@ -194,37 +164,3 @@ def test_text_states_value_and_error_of_each_parameter():
 )
 def test_an_estimator_says_how_its_rows_weigh(estimator, weighing):
     assert estimator.weighing == weighing
-
-
-def test_what_one_segment_alone_determines_has_the_mean_scatter_of_all_others(rng):
-    """The third parameter is that of one segment, the fourth has a prior and no rows."""
-    count, each, sigma = 14, 30, 0.3
-    W = np.zeros((count, each, 4))
-    W[..., :2] = rng.standard_normal((count, each, 2))
-    W[3] = rng.standard_normal((each, 4)) * [0.0, 0.0, 5.0, 0.0]
-    tau = rng.standard_normal((count, each)) * np.linspace(0.2, 0.5, count)[:, None]
-    W, tau = W.reshape(-1, 4), tau.reshape(-1)
-    bread = np.linalg.inv(W.T @ W / sigma**2 + np.diag([0.0, 0.0, 0.0, 1e4]))
-    theta = bread @ W.T @ tau / sigma**2
-    segments = [
-        Factors((triangle_of(A),), (np.arange(4),), np.array([each]), ("a", "b", "c", "d"))
-        for A in np.split(np.column_stack([W, tau]), count)
-    ]
-    found = scatter(segments, theta, np.array([sigma]), bread)
-    squares = 0.0  # of the scores of the first two parameters, which the fourth segment lacks
-    for k in set(range(count)) - {3}:
-        A = W[k * each : (k + 1) * each, :2] / sigma
-        values, V = np.linalg.eigh(np.eye(each) - A @ bread[:2, :2] @ A.T)
-        left = tau[k * each : (k + 1) * each] / sigma - A @ theta[:2]
-        score = A.T @ (V @ ((V.T @ left) / np.sqrt(values)))
-        squares += np.outer(score, score)
-    np.testing.assert_allclose(found.meat[:2, :2], squares, rtol=1e-9)
-    inflation = np.trace(squares @ bread[:2, :2]) / 2.0  # leverages of parameters sum to 1 each
-    np.testing.assert_allclose(found.inflation, inflation, rtol=1e-9)
-    C = found.covariance
-    np.testing.assert_allclose(C[2, 2], found.inflation * bread[2, 2], rtol=1e-9)
-    np.testing.assert_allclose(C[3], 0.0, atol=1e-15)
-    freedom = found.freedom()
-    assert freedom[2] == 1.0
-    assert freedom[3] == np.inf
-    assert ((freedom[:2] > 5.0) & (freedom[:2] <= count)).all()

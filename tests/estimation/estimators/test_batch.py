@@ -3,8 +3,7 @@ import pytest
 from helpers.estimation import NOISE, Case, still_wrist
 
 from robotid.base.exceptions import DataError, RankDeficientError
-from robotid.dynamics.factors import compress
-from robotid.dynamics.problem import Problem
+from robotid.dynamics.factors import Problem, compress
 from robotid.estimation.estimators import OLS, TLS, WLS
 from robotid.estimation.estimators.batch import mixed_tls, solve_factor
 
@@ -33,21 +32,6 @@ def test_what_the_data_do_not_excite_is_refused_by_name(ur5, rng, estimator):
     assert "wrist_3_joint.viscous" in caught.value.undetermined
     assert "shoulder_pan_joint.viscous" not in caught.value.undetermined
     assert f"the data excite {caught.value.rank} of 58 base parameters" in str(caught.value)
-
-
-def test_with_a_prior_the_rest_is_kept(ur5, rng):
-    case = still_wrist(ur5, rng)
-    prior = case.mapping.to_base(ur5.standard_parameters())
-    estimate = WLS(prior=prior).fit(case.problem)
-    other = WLS(prior=prior + 1e-3 * np.abs(prior)).fit(case.problem)
-    factors = compress(case.problem)
-    np.testing.assert_allclose(  # what the data determine has nothing of the prior
-        factors.residual_squares(other.theta), factors.residual_squares(estimate.theta), rtol=1e-6
-    )
-    i = estimate.names.index("wrist_3_joint.viscous")
-    assert estimate.theta[i] == pytest.approx(prior[i], abs=1e-12)
-    assert np.isinf(estimate.std_error[i])
-    assert estimate.rank < 58
 
 
 @pytest.mark.parametrize("share", [1.0, 0.2])

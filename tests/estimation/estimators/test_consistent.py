@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import scipy.stats
 from helpers.estimation import NOISE, Case, consistent
-from helpers.synthetic import truth
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.dynamics.factors import Factors, compress, triangle_of
@@ -16,7 +15,6 @@ from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.interior_point import Entropic
 from robotid.estimation.fitting.estimator_settings import ConstraintSettings
 from robotid.estimation.fitting.fit import make_constraints
-from robotid.robot.geometry import body_boxes
 from robotid.robot.parameters import ParameterLayout, inertial_from_pseudo_inertia, pseudo_inertia
 
 LAYOUT = ParameterLayout(bodies=("one", "two"), joints=("a", "b"), terms=("viscous",))
@@ -132,25 +130,6 @@ def test_a_known_total_mass_is_met_exactly(case):
     assert one @ estimate.covariance @ one == pytest.approx(0.0, abs=1e-12)
 
 
-def test_pinned_bodies_keep_the_urdf_and_the_rest_is_the_constrained_least_squares(case, ur5):
-    fit, factors = case
-    estimate = constrained(fit, pinned=("forearm_link", "wrist_1_link")).fit(factors)
-    np.testing.assert_allclose(estimate.theta[20:40], fit.prior[20:40], rtol=1e-12, atol=1e-12)
-    assert not estimate.std_error[20:40].any()
-    # all others are at a minimum, where no inequality binds
-    fit = replace(fit, prior=truth(ur5), prior_weight=10.0)
-    pinned = constrained(fit, pinned=("forearm_link", "wrist_1_link"))
-    estimate = pinned.fit(factors)
-    assert estimate.details["active"] == []
-    rows = pinned.rows(factors, estimate.sigma)
-    D = rows[:, :-1] @ fit.K
-    slope = D.T @ (D @ estimate.theta - rows[:, -1])
-    slope += 0.5 * fit.prior_weight * fit.programme.penalty.gradient(estimate.theta)
-    kept = np.setdiff1d(np.arange(len(fit.prior)), np.arange(20, 40))
-    slope *= fit.prior_std
-    assert np.abs(slope[kept]).max() < 1e-5 * np.abs(slope).max()
-
-
 def test_without_noise_a_redrawn_fit_is_the_fit_at_its_bounds(case, rng):
     fit, factors = case
     fit = constrained(fit, mass={"forearm_link": (1.2 * masses(fit.fit(factors))[2], np.inf)})
@@ -187,26 +166,6 @@ def test_the_slabs_of_a_box_hold_for_grains_inside_and_fail_for_one_outside(rng)
     assert (value > 0).all()
     x = np.array([0.31, 0.0, 0.1, 1.0])
     np.testing.assert_array_equal(np.sign(np.einsum("kij,i,j->k", slabs(box), x, x)), [-1, 1, 1])
-
-
-def test_extents_keep_the_mass_of_each_body_in_its_box(case, ur5):
-    boxes = {b: 0.2 * box + 0.8 * box.mean(axis=0) for b, box in body_boxes(ur5).items()}
-    loose, factors = case
-    tight = replace(loose, constraints=Constraints(extent=boxes))
-    free, kept = (one.fit(factors) for one in (loose, tight))
-
-    def slack(estimate):
-        J = pseudo_inertia(estimate.theta[:60])
-        return np.array(
-            [np.einsum("kij,ij->k", slabs(boxes[b]), J_i) for b, J_i in zip(boxes, J, strict=True)]
-        )
-
-    assert slack(free).min() < -1e-3
-    assert slack(kept).min() > -1e-7
-    bound = [b for b, values in zip(boxes, slack(kept), strict=True) if values.min() < 1e-7]
-    assert [f"extent {body}" for body in sorted(bound)] == [
-        label for label in kept.details["active"] if label.startswith("extent")
-    ]
 
 
 @pytest.fixture(scope="module")
@@ -284,15 +243,6 @@ def test_the_spread_before_the_data_is_that_of_the_plausible_weight(two_bodies):
         )
         np.testing.assert_allclose(fit.spread_before, spread, rtol=1e-9)
         assert fit.weight_ratio == max(weight / plausible, 1.0)
-
-
-def test_consistent_fit_is_physical_where_least_squares_is_not(ur5, rng):
-    case = Case(ur5, rng, 40 * NOISE, samples=200)
-    free = case.mapping.to_standard(WLS().fit(case.problem).theta, ur5.standard_parameters())
-    assert np.linalg.eigvalsh(pseudo_inertia(free[:60])).min() < 0
-    estimate = consistent(case).fit(case.problem)
-    assert np.linalg.eigvalsh(pseudo_inertia(estimate.theta[:60])).min() > 0
-    assert (estimate.theta[ur5.layout.is_nonnegative()] >= 0).all()
 
 
 def test_a_prior_that_is_not_finite_is_refused(ur5, rng):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers.estimation import RandomStates
 
-from robotid.dynamics.problem import Sample
+from robotid.dynamics.factors import Sample
 from robotid.estimation.estimators import PRX, NormalisedGradient
 from robotid.estimation.estimators.recursive import column_scale
 from robotid.robot.examples import example_urdf

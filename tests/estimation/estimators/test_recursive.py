@@ -6,7 +6,7 @@ import scipy.stats
 from helpers.estimation import NOISE, Case
 
 from robotid.base.exceptions import DataError, RankDeficientError
-from robotid.dynamics.problem import Problem, Sample
+from robotid.dynamics.factors import Problem, Sample
 from robotid.estimation.estimators import RLS, WLS, Kalman, fold
 
 NAMES = ("a", "b", "c")

@@ -11,7 +11,6 @@ from robotid.estimation.fitting.evaluation import (
     _joined,
     evaluate_logs,
     hidden_joints,
-    pool,
     predict,
     shares_rows,
 )
@@ -58,14 +57,6 @@ def test_each_kept_log_is_looked_for_in_each_fitted_one(ur5, rng):
     for fitted in ([a, b], [b, a]):
         _, kept = evaluate_logs(fitted, [b, new, a], {}, None)
         assert [e.is_refitted for e in kept] == [True, False, True]
-
-
-def test_pooled_metrics_are_those_of_all_rows(ur5, rng):
-    pi = truth(ur5)
-    logs = [exact_log(ur5, pi, rng, noise=np.full(6, s), samples=200) for s in (0.1, 0.3)]
-    found = [evaluated(ur5, log, {"x": pi}, pi) for log in logs]
-    squares = [f.metrics["x"].pooled_rmse ** 2 for f in found]
-    np.testing.assert_allclose(pool(ur5, found, "x").pooled_rmse, np.sqrt(np.mean(squares)))
 
 
 def test_joints_are_hidden_whose_torque_changes_less_over_the_rows_used_than_is_left():

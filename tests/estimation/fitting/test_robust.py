@@ -164,21 +164,6 @@ def test_a_row_is_an_outlier_by_the_residual_and_the_torque_of_its_own_joint(mod
         assert outlier.size == pytest.approx(abs(size) / usual[j])
 
 
-def test_friction_that_is_not_coulombs_near_a_reversal_is_no_outlier(model):
-    pi = truth(model)
-    quiet = exact_log(model, pi, np.random.default_rng(4), samples=2000, rate=100.0)
-    noise = 1e-3 * np.random.default_rng(5).standard_normal(quiet.tau.shape)
-    step = pi[[name.endswith(".coulomb") for name in model.layout.names]]
-    smooth = step * (np.tanh(quiet.v / 0.03) - np.sign(quiet.v))
-    log = replace(quiet, tau=quiet.tau + noise + smooth)
-    found = fit(model, [log], estimator="wls")
-    (evaluation,) = found.fitted
-    residual = np.abs(evaluation.recording.trajectory.tau - evaluation.torques["estimate"])
-    usual = np.median(residual, axis=0)
-    assert ((residual > 20 * usual) & evaluation.recording.mask).any()  # it is there
-    assert found.outliers == ()
-
-
 def test_exact_data_need_no_weights(model):
     log = exact_log(model, truth(model), np.random.default_rng(2), samples=300)
     exact = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)

@@ -141,28 +141,6 @@ def test_one_parameter_alone_has_the_others_integrated_out_of_each_run():
         np.testing.assert_allclose(w / W, np.einsum("ki,ki->k", C[:, p], runs.h))
 
 
-@pytest.mark.parametrize(("runs", "ratio", "next_run", "spread"), [
-    (3, 1.0, (0.93, 1.0), (0.93, 1.0)), (5, 0.0, (0.93, 1.0), None),
-    (10, 2.0, (0.90, 0.985), (0.93, 1.0)),
-])  # fmt: skip
-def test_intervals_of_the_next_run_and_of_the_spread_cover(runs, ratio, next_run, spread):
-    rng, inside, known, count = np.random.default_rng(6), 0, 0, 150
-    between = np.full((2, 2), 0.1) * [[ratio], [0.0]]
-    for _ in range(count):
-        every = drawn(rng, [0] * (runs + 1), between, rows=60)
-        x = np.linalg.solve(every.H[-1], every.h[-1])
-        error = np.linalg.inv(every.H[-1])
-        model = SpreadModel(every.without(runs))
-        for p, prediction in enumerate(model.predict()):
-            m = prediction.mixture
-            ends = Mixture(m.weight, m.mean, np.sqrt(m.std**2 + error[p, p])).ends
-            inside += ends[0] < x[p] < ends[1]
-            known += prediction.spread_ends[0] < between[0, p] < prediction.spread_ends[1]
-    assert next_run[0] <= inside / (2 * count) <= next_run[1]
-    if spread:
-        assert spread[0] <= known / (2 * count) <= spread[1]
-
-
 def test_the_mean_of_alike_runs_has_the_error_of_their_joint_fit():
     """Correlated parameters with a small spread: the means of the others count."""
     runs = drawn(np.random.default_rng(3), [0] * 8, np.zeros((2, 2)))

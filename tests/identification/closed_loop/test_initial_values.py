@@ -10,8 +10,8 @@ from helpers.paths import URDF
 from helpers.single_joint import slider
 
 from robotid.data.log import Log
-from robotid.dynamics.prediction import predict_instants
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows
+from robotid.dynamics.torque import predict_instants
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.identification.closed_loop.from_commands import identify_loops
 from robotid.identification.closed_loop.initial_values import (

@@ -4,12 +4,12 @@ import copy
 import json
 import math
 import re
-from html import unescape
+from html import escape, unescape
 
 import numpy as np
 import pytest
 from helpers.pages import number, percent, tables
-from helpers.paths import ROOT
+from helpers.paths import ROOT, URDF
 from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import DataError
@@ -17,6 +17,8 @@ from robotid.base.files import write_json
 from robotid.cli import main
 from robotid.data.files.read import write_log
 from robotid.output.files.result_file import read_result
+from robotid.output.pages.html import page
+from robotid.output.report import comparison
 from robotid.output.report.comparison import compare_results, fleet_page, write_comparison
 from robotid.robot.model import RobotModel
 
@@ -182,3 +184,53 @@ def test_the_failures_of_a_fleet_are_counted_and_the_first_of_each_kind_stand_fi
         ["a", "all", "3", "a: no torque"], ["c", "all", "1", "c: no URDF"],
         ["b", "b.csv", "3", "b.csv: no torque"], ["d", "all", "3", "d: no torque"],
     ]  # fmt: skip
+
+
+MARKUP = "<script>alert(1)<!--'\""
+
+
+@pytest.fixture(scope="module")
+def marked(tmp_path_factory):
+    """Two results of a robot whose names are all markup, of files and folders that are, too."""
+    folder = tmp_path_factory.mktemp("markup")
+    text = (URDF / "planar_2r.urdf").read_text()
+    for name in ("planar_2r", "link_1", "link_2", "joint_1", "joint_2"):
+        text = text.replace(f'"{name}"', f'"{escape(MARKUP + name)}"')
+    urdf = folder / f"{MARKUP}.urdf"
+    urdf.write_text(text)
+    model, rng = RobotModel.from_urdf(urdf), np.random.default_rng(0)
+    assert model.joints == (f"{MARKUP}joint_1", f"{MARKUP}joint_2")
+    for name in ("fit", "keep"):
+        log = exact_log(model, truth(model), rng, samples=1000, rate=100.0, noise=0.1)
+        write_log(log, folder / f"{MARKUP}{name}.parquet")
+    logs = [str(folder / f"{MARKUP}{name}.parquet") for name in ("fit", "keep")]
+    for estimator in ("consistent", "wls"):
+        words = ["identify", str(urdf), logs[0], "--validate", logs[1], "--estimator", estimator]
+        assert main([*words, "--out", str(folder / f"<b>{estimator}")]) == 0
+    results = [str(folder / f"<b>{name}") for name in ("consistent", "wls")]
+    assert main(["compare", *results, "--out", str(folder / "compare.html")]) == 0
+    words = ["replay", str(urdf), logs[0], *results, "--ghost", logs[1]]
+    assert main([*words, "--html", str(folder / "replay.html")]) == 0
+    return folder
+
+
+def test_no_name_becomes_markup(marked):
+    pages = sorted(marked.rglob("*.html"))
+    assert len(pages) == 4
+    for made in pages:
+        text = made.read_text(encoding="utf-8")
+        assert "alert(1)" in text
+        assert "<script>alert" not in text, made.name
+        assert "<b>" not in text.partition("<body>")[2].partition("<script")[0], made.name
+
+
+def test_a_status_of_another_program_is_refused_and_escaped(marked, tmp_path):
+    result = json.loads((marked / "<b>wls" / "result.json").read_text())
+    result["verdict"]["status"] = 'good"><script>alert(1)</script>'
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps(result))
+    with pytest.raises(DataError, match=r"verdict.status is .*, wanted one of good, usable"):
+        read_result(path)
+    shown = {"label": "A", "name": "", "path": "", "estimator": "", "verdict": result["verdict"]}
+    text = page("", comparison._verdict(shown), {})
+    assert "<script>alert" not in text

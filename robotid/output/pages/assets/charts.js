@@ -117,7 +117,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
   constructor(parent, what) {
     this.what = what;
     this.link = link(what.link);
-    this.hidden = new Set(what.series.flatMap(({ hidden }, i) => (hidden ? [i] : [])));
+    this.hidden = new Set(what.series.flatMap((series, i) => (series.is_hidden ? [i] : [])));
     this.below = what.x_label ? 56 : 36; // [px] that the x axis takes
     this.plot = null;
     this.index = -1; // row under the cursor
@@ -282,8 +282,8 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
       axes: [axis({ size: 28, label: name || null, labelSize: name ? 20 : 0, labelGap: 2, space: 70,
         labelFont: "11px system-ui, sans-serif", ...decades("x") }),
       axis({ size: 54, space: 22, ...decades("y") })],
-      series: [{}, ...series.map(({ tone: colour, kind, faint }, i) => ({ show: !this.hidden.has(i),
-        stroke: () => tone(colour), width: 1.3, alpha: faint ? FAINT : 1, points: { show: false },
+      series: [{}, ...series.map(({ tone: colour, kind, is_weak: weak }, i) => ({ show: !this.hidden.has(i),
+        stroke: () => tone(colour), width: 1.3, alpha: weak ? FAINT : 1, points: { show: false },
         ...(kind === "line" ? {} : { paths: () => null }) }))],
       hooks: { draw: [() => this.move()], drawAxes: [(u) => this.paint(u)], setSelect: [(u) => this.select(u)] },
     }, this.columns(), this.place);
@@ -323,7 +323,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     this.what.series.forEach((series, i) => {
       if (this.hidden.has(i)) return;
       ctx.fillStyle = ctx.strokeStyle = tone(series.tone);
-      const opacity = series.faint ? FAINT : 1;
+      const opacity = series.is_weak ? FAINT : 1;
       ctx.globalAlpha = opacity;
       if (series.kind === "dots") this.dots(ctx, this.ys[i], X, Y, ratio);
       if (series.kind === "area" || (series.kind === "line" && this.halves[i])) {

@@ -53,8 +53,8 @@ function drawTorques() {
       spans: levels ? resting(j) : [], marks, logarithmic: "", height });
     const chart = add(`${torques.quantity} of ${name} over time`, `${torques.quantity} [${unit}]`,
       torques.labels.map((label, k) =>
-        ({ label, tone: tones[k], kind: "line", y: ys[k], half: null, faint: k > 1,
-          hidden: models.length > 0 && k > 0 && k - 1 !== chosen })), 100);
+        ({ label, tone: tones[k], kind: "line", y: ys[k], half: null, is_weak: k > 1,
+          is_hidden: models.length > 0 && k > 0 && k - 1 !== chosen })), 100);
     // on an axis of its own, where a small one is visible
     const label = `measured − ${models.length ? "shown" : torques.labels[1]}`;
     const below = predictions ? add(`residual of ${name} over time`, `residual [${unit}]`,
