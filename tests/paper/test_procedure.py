@@ -5,7 +5,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from helpers.synthetic import truth
 
@@ -111,15 +110,6 @@ def states(rng, count, n):
     return rng.uniform(-np.pi, np.pi, (count, n)), *rng.uniform(-3, 3, (2, count, n))
 
 
-def test_mass_matrix_from_base_parameters_is_pinocchios_crba(arm, ur5, rng):
-    pi = ur5.standard_parameters()
-    q, _, _ = states(rng, 10, 6)
-    data = ur5.pin_model.createData()
-    for D, q_k in zip(arm.mass_matrix(q, structural_mapping(ur5).to_base(pi)), q, strict=True):
-        M = pin.crba(ur5.pin_model, data, q_k)
-        np.testing.assert_allclose(D, np.triu(M) + np.triu(M, 1).T, atol=1e-12)
-
-
 def test_a_linear_plant_moves_as_the_robot_does(arm, ur5, rng):
     pi = truth(ur5)
     q, v, u = states(rng, 10, 6)
@@ -140,12 +130,6 @@ def test_proximity_is_the_gradient_of_the_criterion(rng):
     np.testing.assert_allclose(proximity(Psi, P, u), slopes, atol=1e-8)
 
 
-def test_the_proximity_vanishes_at_the_truth(rng):
-    Psi, P = rng.normal(size=(3, 2, 5)), rng.normal(size=(3, 5))
-    u = np.einsum("rnc,rc->rn", Psi, P)
-    np.testing.assert_allclose(proximity(Psi, P, u), 0.0, atol=1e-14)
-
-
 @pytest.mark.parametrize(("change", "why"), [
     ({"is_open": np.array(False)}, "PRX is zero"), ({"eps2": 1e9}, "the sample is small"),
     ({"sigma": np.array(-0.1)}, "D is not positive definite"),
@@ -155,14 +139,6 @@ def test_an_update_is_left_out_where(change, why, rng):
     arguments = {"sigma": np.array(1.0), "is_open": np.array(True), **change}
     found = recursive_update(P, Psi, eta, **arguments)
     np.testing.assert_array_equal(found, P, err_msg=why)
-
-
-def test_one_shot_finds_the_truth_from_any_guess(rng):
-    G, P, P_hat = rng.normal(size=(40, 5)), rng.normal(size=5), rng.normal(size=5)
-    # G_* with G P = G_* P^: any matrix, moved along P^ so that the torques agree
-    G_star = rng.normal(size=(40, 5))
-    G_star += np.outer(G @ P - G_star @ P_hat, P_hat) / (P_hat @ P_hat)
-    np.testing.assert_allclose(one_shot(G, G_star, P_hat, "abcde"), P, rtol=1e-12)
 
 
 def test_one_shot_names_what_the_motion_leaves_open(rng):
