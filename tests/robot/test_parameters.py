@@ -10,6 +10,7 @@ from helpers.synthetic import truth
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.bodies import (
+    LinkPlace,
     central_inertial,
     held_parameters,
     least_density,
@@ -79,6 +80,9 @@ def test_names_and_units_follow_the_layout():
     assert unit["slide.coulomb"] == "N"
     assert "motor.offset" not in unit
     assert layout.is_nonnegative().sum() == 3 * 3
+    preference = dict(zip(layout.names, layout.preference(), strict=True))
+    assert [preference[f"arm.{x}"] for x in ("m", "mcx", "Ixy")] == [0.1, 0.3, 1.0]
+    assert [preference[f"elbow.{x}"] for x in ("armature", "viscous")] == [0.3, 1.0]
 
 
 def test_a_coupling_may_stand_in_the_place_of_a_joints_own_drive():
@@ -121,7 +125,8 @@ def test_a_slider_counts_by_its_stroke_and_a_coupling_by_the_mean_of_its_joints(
     own = [
         name for name, mine in zip(layout.names, layout.owned_by(["b", "x"]), strict=True) if mine
     ]
-    assert own == [*layout.inertial_names, *(n for n in layout.drive_names if n.startswith("b."))]
+    of_b = [name for name in layout.drive_names if name.startswith("b.")]
+    assert own == [*(f"x.{term}" for term in INERTIAL_TERMS), *of_b]
     length = 0.4
     wanted = [1.0, *[0.4] * 3, *[0.16] * 6]
     wanted += [0.16 if n in ("a.armature", "motor.armature") else 1.0 for n in layout.drive_names]
@@ -215,6 +220,7 @@ def test_links_behind_a_locked_joint_are_held(panda):
     role = {place.link: place.role for place in places}
     lumped = {place.link for place in places if place.is_lumped}
     assert lumped == {"panda_link8", "panda_hand", "panda_hand_tcp"}
+    assert not LinkPlace("of the world", -1, "fixed", np.zeros(10)).is_lumped
     assert role["panda_link7"] == "moved"
     assert role["panda_hand"] == "fixed"
     assert role["panda_leftfinger"] == "held"
