@@ -12,6 +12,7 @@ import sys
 import textwrap
 import tomllib
 from importlib import import_module
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -21,6 +22,7 @@ from helpers.corruptions import CASES
 from helpers.mujoco_plant import plant, recorded
 from helpers.paths import DOCS, ROOT
 from helpers.recorders import write_lerobot
+from helpers.replay_data import leave_out_meshes
 from helpers.synthetic import exact_log, truth
 
 import robotid
@@ -140,31 +142,23 @@ def test_the_page_on_simulation_says_what_the_settings_say_and_runs(tmp_path, mo
     assert np.mean(error < 3) > 0.9
 
 
-def test_the_first_tutorial_runs_as_written(tmp_path):
+def test_the_first_tutorial_runs_as_written(tmp_path, monkeypatch, capsys):
     """In an empty folder, as a user, but with a shorter search; numbers may differ."""
-    programs, folder = tmp_path / "bin", tmp_path / "empty"
-    for name, words in (("robotid", "-m robotid"), ("python", "")):
-        programs.mkdir(exist_ok=True)
-        (programs / name).write_text(f'#!/bin/sh\nexec "{sys.executable}" {words} "$@"\n')
-        (programs / name).chmod(0o755)
-    folder.mkdir()
-    paths = {"PATH": f"{programs}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
-    page = "tutorials/first_arm.md"
+    page, namespace = "tutorials/first_arm.md", {}
+    monkeypatch.chdir(tmp_path)
+    leave_out_meshes(monkeypatch)
+    paths = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
     found = re.findall(r"^```(bash|python)\n(.*?)^```$", (DOCS / page).read_text(), re.S | re.M)
-    brief = [
-        (language, block.replace("--starts 1", "--starts 1 --points 20"))
-        for language, block in found
-    ]
-    runs = [["bash", "-ec", block] for language, block in brief if language == "bash"]
-    first = [language for language, _ in found].index("python")
-    runs.insert(first, ["python", "-c", "".join(blocks(page, "python"))])  # in one session
-    printed = ""
-    for words in runs:
-        run = subprocess.run(
-            words, cwd=folder, env=os.environ | paths, capture_output=True, text=True
-        )
-        assert run.returncode == 0, words[-1] + run.stderr
-        printed += run.stdout
+    for language, block in found:
+        if language == "python":
+            exec(compile(block, page, "exec"), namespace)
+        brief = block.replace("--starts 1", "--starts 1 --points 20")
+        for line in brief.splitlines() if language == "bash" else ():
+            if line.startswith("robotid "):
+                assert main(shlex.split(line)[1:]) == 0, line
+            else:
+                subprocess.run(["bash", "-ec", line], env=os.environ | paths, check=True)
+    printed = capsys.readouterr().out
     assert "verdict: good" in printed
     assert "verdict good" in printed  # in Python
     shown = "".join(blocks(page, "text")).replace("+ ...", "")
@@ -174,7 +168,7 @@ def test_the_first_tutorial_runs_as_written(tmp_path):
     best = re.findall(r"^ *(\S+) \+- (\S+)  \S", printed, re.MULTILINE)
     assert len(best) == 6
     assert all(abs(float(value)) > 10 * float(error) for value, error in best)
-    written = {path.name for path in (folder / "result").iterdir()}
+    written = {path.name for path in (tmp_path / "result").iterdir()}
     assert {"report.html", "robot.identified.urdf", "result.json", "replay.html"} <= written
 
 

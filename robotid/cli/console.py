@@ -175,8 +175,21 @@ def print_error(error: BaseException, words: str = "") -> None:
 
 @contextmanager
 def shown_log(*, is_verbose: bool) -> Iterator[None]:
-    """Show warnings of the logger "robotid" on the standard error stream."""
-    logger, handler = logging.getLogger("robotid"), _EachOnce()
+    """Show warnings of the logger "robotid" on the standard error stream.
+
+    A message is printed once, its figures make no difference: otherwise each piece of a long log
+    repeats the message with its own number of samples.
+    """
+    logger, handler, printed = logging.getLogger("robotid"), logging.StreamHandler(), set[str]()
+
+    def is_new(record: logging.LogRecord) -> bool:
+        words = re.sub(r"[0-9]+", "#", record.getMessage())
+        is_first = words not in printed
+        printed.add(words)
+        return is_first
+
+    handler.setFormatter(logging.Formatter("robotid: %(message)s"))
+    handler.addFilter(is_new)
     level = logger.level
     logger.addHandler(handler)
     logger.setLevel(logging.INFO if is_verbose else logging.WARNING)
@@ -185,25 +198,6 @@ def shown_log(*, is_verbose: bool) -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         logger.setLevel(level)
-
-
-class _EachOnce(logging.Handler):
-    """Prints a message on the standard error stream once; its figures make no difference.
-
-    Otherwise each piece of a long log repeats the message with its own number of samples.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._printed: set[str] = set()
-
-    def emit(self, record: logging.LogRecord) -> None:
-        text = record.getMessage()
-        words = re.sub(r"[0-9]+", "#", text)
-        if words not in self._printed:
-            self._printed.add(words)
-            with suppress(BrokenPipeError):  # the work is completed without a reader
-                print(f"robotid: {text}", file=sys.stderr)
 
 
 @contextmanager

@@ -66,9 +66,9 @@ def _standard_names(
     by_joint: dict[str, list[str]] = {}
     quantities = [(name, quantity_of(name, source.effort, joint_of)) for name in names]
     for kind in KINDS:
-        for name, found in quantities:
-            if found and found[0] == kind:
-                joint = joint_of.get(found[1], found[1])
+        for name, quantity in quantities:
+            if quantity and quantity[0] == kind:
+                joint = joint_of.get(quantity[1], quantity[1])
                 pairs.append((f"{kind}_{joint}", name))
                 by_joint.setdefault(joint, []).append(f"{kind}_{joint}")
     if twice := repeated([key for key, _ in pairs]):

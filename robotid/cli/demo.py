@@ -48,8 +48,8 @@ def run_demo(
         urdf=Path(model.tree.path), locked=_LOCKED, signals=SignalSettings(cutoff=10.0),
         identification=(entries[0],), validation=(entries[1],), replay=True,
     )  # fmt: skip
-    found, result = run_job(job, target, plan=WorkPlan(progress=progress))
-    identification = cast(TorqueIdentification, found)  # of the default estimator
+    concluded, result = run_job(job, target, plan=WorkPlan(progress=progress))
+    identification = cast(TorqueIdentification, concluded)  # of the default estimator
     true = dict(zip(model.layout.names, truth, strict=True))
     # a drive term that the data shows, and the simulated robot does not have, is truly 0
     pi = np.array([true.get(name, 0.0) for name in identification.model.layout.names])
@@ -64,7 +64,7 @@ def run(options: argparse.Namespace) -> None:
     echo("simulating a Unitree Z1 arm whose masses, armature and friction differ from its URDF ...")
     with progress_of(options) as progress:
         identification, result, truth = run_demo(options.out, progress=progress)
-    show_result(result)
+    show_result(result, identification.findings)
     error = identification.base - truth
     within = sum(abs(error) < 3 * identification.base_error)
     echo(f"\n{within} of {len(truth)} base parameters lie within 3 standard errors of the truth")

@@ -91,14 +91,10 @@ def _designer(
     model, run = job.model(), None
     if given is not None:
         _, _, model, run = result_run(job, given)
-    name = settings.criterion
-    if name is None:
-        name = "D" if run is None else "widest"
-    elif name == "widest" and run is None:
-        raise SettingsError(
-            "criterion is widest, which needs an earlier result: wanted --given RESULT, or another "
-            "criterion"
-        )
+    name = settings.criterion or ("D" if run is None else "widest")
+    if name == "widest" and run is None:
+        words = "criterion is widest, which needs an earlier result"
+        raise SettingsError(f"{words}: wanted --given RESULT, or another criterion")
     model.require_fixed("motion design")
     limits = MotionLimits.of_model(
         model, share=settings.share, velocity=settings.velocity, torque=settings.torque,
@@ -108,10 +104,9 @@ def _designer(
     if least is not None:
         clearance = Clearance(model, least=least, floor=settings.floor, boxes=settings.boxes)
     basis = FourierBasis(settings.duration, settings.harmonics)
-    designer = Designer.of_model(
+    return Designer.of_model(
         model, basis, limits, name=name, clearance=clearance, noise=settings.noise, run=run
-    )
-    return designer, run
+    ), run
 
 
 def _designed(

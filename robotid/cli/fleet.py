@@ -311,7 +311,7 @@ class _Gathered:
         self._verdicts.update([row["verdict"] for row in rows if row.get("verdict")][:1])
 
     def content(self, units: Sequence[FleetUnit]) -> dict[str, Any]:
-        several = {key: found for key, found in self._values.items() if len(found) >= FEWEST_RUNS}
+        several = {key: rows for key, rows in self._values.items() if len(rows) >= FEWEST_RUNS}
         n_tests = sum(map(len, several.values()))
         parameters, unlike = [], []
         for (robot, name, expression, unit), estimates in several.items():

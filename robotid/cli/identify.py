@@ -318,9 +318,19 @@ def identify_job(
     """Identify from a job's logs; nothing is written."""
     check_ignored(job.ignore)
     report_stage(plan.progress, "reading logs", _stages(job.estimator))
-    if isinstance(job.estimator, SimulationSettings):
-        return _identify_loops(job, model, plan.progress)
     groups = job.identification, job.validation
+    if isinstance(job.estimator, SimulationSettings):
+        from robotid.identification.closed_loop.from_commands import identify_loops
+
+        needs = needed_of(job.controller)
+        logs, held_out = ([job.read(x, model, needs=needs) for x in entries] for entries in groups)
+        identification = identify_loops(
+            model, logs, held_out, job.controller, job.estimator, signals=job.signals,
+            chooses=AUTO in job.terms, examined=diagnose(model, logs, held_out, job.signals),
+            ignore=job.ignore, units=units_of_logs(job.identification),
+            progress=plan.progress or ignore_progress,
+        )  # fmt: skip
+        return replace(identification, stated=replace(identification.stated, job=job))
     fitted, validation = survey_logs(job, model, *groups, refuse=refuse)
     if not fitted:
         which = "no log is usable" if job.identification else "no log is given"
@@ -343,12 +353,9 @@ def identify_job(
             recordings, job.estimator, findings, job.ignore, friction=job.friction,
             progress=plan.progress,
         )  # fmt: skip
-    return replace(
-        concluded,
-        stated=replace(concluded.stated, job=job),
-        findings=(*notes, *concluded.findings),
-        payload_checks=check_payloads(job, concluded.model, fitted),
-    )
+    checks = check_payloads(job, concluded.model, fitted)
+    stated, noted = replace(concluded.stated, job=job), (*notes, *concluded.findings)
+    return replace(concluded, stated=stated, findings=noted, payload_checks=checks)
 
 
 def _stages(choice: EstimatorSettings) -> Sequence[str]:
@@ -358,26 +365,6 @@ def _stages(choice: EstimatorSettings) -> Sequence[str]:
     from robotid.identification.closed_loop import stages
 
     return stages.STAGES
-
-
-def _identify_loops(
-    job: Job, model: RobotModel, progress: ProgressCallback | None
-) -> Identification:
-    """Identify by simulation, from commands or logged torques."""
-    from robotid.identification.closed_loop.from_commands import identify_loops
-
-    assert isinstance(job.estimator, SimulationSettings)
-    logs, validation = (
-        [job.read(entry, model, needs=needed_of(job.controller)) for entry in entries]
-        for entries in (job.identification, job.validation)
-    )
-    identification = identify_loops(
-        model, logs, validation, job.controller, job.estimator, signals=job.signals,
-        chooses=AUTO in job.terms, examined=diagnose(model, logs, validation, job.signals),
-        ignore=job.ignore, units=units_of_logs(job.identification),
-        progress=progress or ignore_progress,
-    )  # fmt: skip
-    return replace(identification, stated=replace(identification.stated, job=job))
 
 
 MAIN_FLAGS = (
@@ -414,10 +401,10 @@ def run(options: argparse.Namespace) -> int:
 
 
 def show_result(
-    result: dict[str, Any], *, findings: Sequence[Finding] = (), is_verbose: bool = False
+    result: dict[str, Any], findings: Sequence[Finding], *, is_verbose: bool = False
 ) -> None:
-    width, wls = terminal_width(), result.get("wls")
-    echo(f"\n{result['robot']}: {len(result['joints'])} joints, {_found(result)}")
+    width, wls, verdict = terminal_width(), result.get("wls"), result["verdict"]
+    echo(f"\n{result['robot']}: {len(result['joints'])} joints, {_structure_words(result)}")
     roles = ("identification", "validation")
     fitted, validation = (recordings_of(result["inputs"], role) for role in roles)
     echo(f"\nfitted: {', '.join(fitted)}", "  ")
@@ -428,16 +415,14 @@ def show_result(
     if lines := _drive_lines(result):
         print("\n" + "\n".join(wrapped(line, width, "  ") for line in lines))
     print()
-    verdict = result["verdict"]
     print_causes(
-        findings or [Finding(**entry) for entry in result["warnings"]], result["joints"],
-        is_verbose=is_verbose, worst="" if verdict["status"] == "good" else _worst(result),
-        printed=verdict["reasons"],
+        findings, result["joints"], is_verbose=is_verbose, printed=verdict["reasons"],
+        worst="" if verdict["status"] == "good" else _worst(result),
     )  # fmt: skip
     print_verdict(verdict)
 
 
-def _found(result: Mapping[str, Any]) -> str:
+def _structure_words(result: Mapping[str, Any]) -> str:
     """Return the number of parameters and their conditioning, as text."""
     if "simulation" in result:
         from robotid.identification.closed_loop.position_errors import DRIFTS  # imports numpy

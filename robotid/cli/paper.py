@@ -35,5 +35,5 @@ def _show(result: dict[str, Any]) -> None:
         cells = [errors[0], errors[1], errors[-1], *ends]
         print(f"  {name:10}" + "".join(f"{cell:9.2g}" for cell in cells) + f"   {model['NA']}")
     print("\nrandom motions that converged to 1e-3")
-    for name, found in result["trajectories"].items():
-        print(f"  {name:10} {found['converged']} of {found['runs']}")
+    for name, motions in result["trajectories"].items():
+        print(f"  {name:10} {motions['converged']} of {motions['runs']}")

@@ -137,8 +137,8 @@ def run(options: argparse.Namespace) -> None:
 
 def _show(content: dict[str, Any]) -> None:
     checks = {check["link"]: check for check in content.get("mass_checks", ())}
-    for found in content["payloads"]:
-        _print_one_payload(found, checks.get(found["link"]))
+    for load in content["payloads"]:
+        _print_one_payload(load, checks.get(load["link"]))
     errors = [f"{joint} {cell(x)} %" for joint, x in content["relative_error_pct"].items()]
     echo(f"torque prediction error: {listed(errors)}", "  ")
     if "gains" in content:
@@ -151,38 +151,36 @@ def _show(content: dict[str, Any]) -> None:
             print(f"{joint} = {value}  # 95 % interval {low:.4g} to {high:.4g}")
 
 
-def _print_one_payload(found: Mapping[str, Any], check: Mapping[str, Any] | None) -> None:
-    link = found["link"]
-    mass, error = in_digits_of(found["mass"], found["mass_std_error"])
+def _print_one_payload(load: Mapping[str, Any], check: Mapping[str, Any] | None) -> None:
+    link = load["link"]
+    mass, error = in_digits_of(load["mass"], load["mass_std_error"])
     print(f"payload on {link}")
     if error == "-":
-        print(f"  mass {found['mass']:g} kg, stated")
+        print(f"  mass {load['mass']:g} kg, stated")
         if check is not None:
             echo(f"  scale of the torques: {check['message']}", "  ")
     else:
-        low, high = (
-            in_digits_of(end, found["mass_std_error"])[0] for end in found["mass_interval"]
-        )
+        low, high = (in_digits_of(end, load["mass_std_error"])[0] for end in load["mass_interval"])
         scale = "torque gains that are too large give a mass that is too large"
         echo(
             f"  mass {mass} kg (95 % interval {low} to {high}). It is proportional to the torque "
             f"scale: {scale}", "  ",
         )  # fmt: skip
-    if found["com"] is not None:
+    if load["com"] is not None:
         print(f"  centre of mass in the frame of {link} [m]")
-        _print_values(zip("xyz", found["com"], found["com_std_error"], strict=True))
-    if found["inertia"] is not None:
+        _print_values(zip("xyz", load["com"], load["com_std_error"], strict=True))
+    if load["inertia"] is not None:
         for where, key, errors in (
-            ("its centre of mass", "inertia", found["inertia_std_error"]),
+            ("its centre of mass", "inertia", load["inertia_std_error"]),
             (f"the origin of {link}", "inertia_at_link", [[None] * 3] * 3),
         ):
             echo(f"  inertia about {where}, axes of {link} [kg m^2]", "  ")
             upper = [(i, j) for i in range(3) for j in range(i, 3)]
-            inertia = found[key]
+            inertia = load[key]
             _print_values(
                 ("I" + "xyz"[i] + "xyz"[j], inertia[i][j], errors[i][j]) for i, j in upper
             )
-    for name, reason in found["reasons"].items():
+    for name, reason in load["reasons"].items():
         what = "centre of mass" if name == "com" else name
         echo(f"  {what}: not determined; {reason}", "  ")
 

@@ -70,16 +70,14 @@ class Findings:
 
 def read_findings(paths: Sequence[str | Path]) -> Findings:
     """Read results to show; the label of a result is the name of its folder."""
-    results: dict[str, Result] = {}
-    tracks: list[tuple[Path, Mapping[str, Any]]] = []
-    beside: list[Path] = []
+    results, tracks, beside = dict[str, Result](), list[tuple[Path, Mapping[str, Any]]](), [Path()]
     for path in map(Path, paths):
         files = [path]
         if path.is_dir():
-            files = [path / name for name in ("result.json", "track.json")]
-            files = [file for file in files if file.is_file()]
-            if not files:
-                raise DataError(f"{str(path)!r} has no result.json and no track.json")
+            names = ("result.json", "track.json")
+            files = [path / name for name in names if (path / name).is_file()]
+        if not files:
+            raise DataError(f"{str(path)!r} has no result.json and no track.json")
         beside.append(files[0].parent)
         for file in files:
             content = read_json(file, "result")
@@ -93,7 +91,7 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
     if len(tracks) > 1:
         raise DataError(f"{len(tracks)} tracks are given, wanted at most one")
     folder, track = tracks[0] if tracks else (Path(), None)
-    return Findings(results, track, folder, (beside or [Path()])[0])
+    return Findings(results, track, folder, beside[min(1, len(paths))])
 
 
 def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = None) -> Replay:
@@ -187,10 +185,10 @@ def _replay_commanded(job: Job, results: Mapping[str, Result], ghost: str | Path
 def _base_poses(job: Job, entry: LogEntry, log: Log) -> Array | None:
     """Return the poses of a floating base, (N, 7) as x y z qx qy qz qw; None without columns."""
     table = open_table(entry.path, job.source)
-    time = [name for name in ("time", "t") if name in table.names]
-    if not time or not {*_BASE} <= {*table.names}:
+    time = next((name for name in ("time", "t") if name in table.names), None)
+    if time is None or not {*_BASE} <= {*table.names}:
         return None
-    columns = table.read([time[0], *_BASE])
+    columns = table.read([time, *_BASE])
     pose = np.column_stack([columns[name] for name in _BASE])
     known = np.isfinite(pose).all(axis=1)
     if not known.any():
@@ -200,7 +198,7 @@ def _base_poses(job: Job, entry: LogEntry, log: Log) -> Array | None:
     except DataError as error:
         remedy = "remove these columns for a fixed base"
         raise DataError(f"{entry.path.name}: {error}; {remedy}") from error
-    t = columns[time[0]][known]
+    t = columns[time][known]
     at = np.column_stack([np.interp(log.t, t, column) for column in pose.T])
     at[:, 3:] /= np.linalg.norm(at[:, 3:], axis=1, keepdims=True)
     return at
@@ -267,14 +265,14 @@ def _payloads(track: Mapping[str, Any] | None) -> list[Mark]:
 
 def _limits_used(job: Job, motion: Log, model: RobotModel) -> tuple[list[Mark], list[str]]:
     """Return marks at the smallest margin to each limit and at the smallest distance, and notes."""
-    v = np.gradient(motion.q, motion.t, axis=0) if motion.v is None else motion.v
-    a = np.gradient(v, motion.t, axis=0) if motion.a is None else motion.a
-    torque = predict_instants(model, model.standard_parameters(), motion.q, v, a)
-    marks, notes = [], ["The motion has no torques. Marks: largest use of each limit of the URDF."]
     try:
         limits = MotionLimits.of_model(model, share=1.0)
     except SettingsError as error:
         return [], [f"The motion has no torques. Limits are not marked: {error}."]
+    v = np.gradient(motion.q, motion.t, axis=0) if motion.v is None else motion.v
+    a = np.gradient(v, motion.t, axis=0) if motion.a is None else motion.a
+    torque = predict_instants(model, model.standard_parameters(), motion.q, v, a)
+    marks, notes = [], ["The motion has no torques. Marks: largest use of each limit of the URDF."]
     course = Course.of_motion(motion.t, (motion.q, v, a, torque), limits)
     for kind, used in zip(LIMITS, course.largest, strict=True):
         joint = int(np.argmax(used))

@@ -76,9 +76,9 @@ def simulate(
     """
     settings, job, target = settings or Simulation(), as_job(robot), Path(log)
     truth = target.with_name(f"{target.stem}.truth.json")
-    for path in (log, truth, urdf):
-        if path is not None:
-            check_file(Path(path), [motion, job.urdf])
+    outputs = [path for path in (log, truth, urdf) if path]
+    for path in outputs:
+        check_file(Path(path), [motion, job.urdf])
     check_suffix(target)
     model = job.model()
     course = _motion(job, model, Path(motion), cutoff)
@@ -98,7 +98,7 @@ def simulate(
     content = _truth(model, pi, settings, run, measured) | {
         "urdf": str(job.urdf),
         "motion": {"path": str(motion), "sha256": file_sha256(motion)},
-        "outputs": [str(path) for path in (log, truth, urdf) if path],
+        "outputs": [*map(str, outputs)],
     }
     if urdf:  # first: an impossible URDF is refused before any file is written
         write_urdf(model, pi, urdf, dynamics=True)
@@ -236,10 +236,9 @@ def _show(content: dict[str, Any]) -> None:
         share = 100 * joint["at_limit"]
         print(f"; at the effort limit for {share:.2g} % of the time" if share > 0 else "")
         if joint["range"] < _HALF * joint["commanded"]:
+            moves = f"moves {joint['range']:.2g} {unit}, wanted the {joint['commanded']:.2g} {unit}"
+            values = f'[truth] values = {{ "{name}.coulomb" = 0 }}'
             echo(
-                f"  warning: {name} moves {joint['range']:.2g} {unit}, wanted the "
-                f"{joint['commanded']:.2g} {unit} commanded. If its friction stops it, state it in "
-                "the file of --plant: "
-                f'[truth] values = {{ "{name}.coulomb" = 0 }}, or larger gains under [controller]',
-                "  ", "warning",
+                f"  warning: {name} {moves} commanded. If its friction stops it, state it in the "
+                f"file of --plant: {values}, or larger gains under [controller]", "  ", "warning",
             )  # fmt: skip

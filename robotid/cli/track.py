@@ -26,10 +26,8 @@ def run_track(job: Job, folder: str | Path) -> dict[str, Any]:
     check_folder(target, [history, "track.json"], [job.urdf, entry.path])
     log = job.read(entry, model)
     if job.signals.cutoff is None:
-        raise SettingsError(
-            "the cutoff is disabled, but the online estimator differentiates positions; state a "
-            "cutoff in Hz"
-        )
+        words = "the cutoff is disabled, but the online estimator differentiates positions"
+        raise SettingsError(f"{words}; state a cutoff in Hz")
     rate = job.signals.rate or 1.0 / float(np.median(np.diff(log.t)))
     cutoff, slowest = job.signals.cutoff, job.signals.min_velocity
     settings = OnlineSettings(rate=rate, cutoff=cutoff, min_velocity=slowest)
@@ -43,9 +41,9 @@ def run_track(job: Job, folder: str | Path) -> dict[str, Any]:
 
 
 def _summary(tracked: Track, job: Job, log: Log, history: str) -> dict[str, Any]:
-    identifier = tracked.identifier
+    identifier, last = tracked.identifier, tracked.identifier.reading
     model, mapping = identifier.model, identifier.mapping
-    pairs, last = zip(tracked.t.tolist(), tracked.readings, strict=True), identifier.reading
+    pairs = zip(tracked.t.tolist(), tracked.readings, strict=True)
     converged = [t for t, reading in pairs if reading.converged]
     units = [model.layout.units[i] for i in mapping.independent]
     rows = zip(mapping.base_names, mapping.expressions, last.theta.tolist(),
@@ -86,21 +84,21 @@ def run(options: argparse.Namespace) -> None:
     show_found(content, options, _show, [content["history"], "track.json"], options.out)
 
 
-def _show(found: dict[str, Any]) -> None:
-    converged = found["converged_at"]
+def _show(content: dict[str, Any]) -> None:
+    converged = content["converged_at"]
     when = "not converged" if converged is None else f"converged at {converged:.2f} s"
     echo(
-        f"{found['robot']}: {found['samples']} samples, delay of the estimate "
-        f"{1e3 * found['delay']:.0f} ms, {when}, excitation {found['excitation']:.2f}"
+        f"{content['robot']}: {content['samples']} samples, delay of the estimate "
+        f"{1e3 * content['delay']:.0f} ms, {when}, excitation {content['excitation']:.2f}"
     )
-    for change in found["changes"]:
+    for change in content["changes"]:
         load = change["payload"]
         mass, error = in_digits_of(load["mass"], load["std_error"])
         when = f"at {change['onset']:.2f} s, detected at {change['flagged']:.2f} s"
         payload = f"equivalent payload on {load['body']}: {mass} +- {error} kg"
         echo(f"step change {when}; {payload}", "  ")
     rows = []
-    for entry in found["base_parameters"]:
+    for entry in content["base_parameters"]:
         value, error = in_digits_of(entry["value"], entry["std_error"])
         rows.append([entry["name"], value, f"+- {error}", entry["unit"]])
     print("\n".join(columns(["", "", "", ""], rows, left=(0, 2, 3))[1:]))

@@ -242,9 +242,9 @@ def run(options: argparse.Namespace) -> None:
     show_found(validate(options.result, entries), options, _show)
 
 
-def _show(found: dict[str, Any]) -> None:
-    echo(f"predicted with {found['predicted_with']}")
-    for recording in found["validation"]:
+def _show(content: dict[str, Any]) -> None:
+    echo(f"predicted with {content['predicted_with']}")
+    for recording in content["validation"]:
         echo(f"\n{recording['name']}", "  ")
         print("\n".join(error_lines(recording, width=terminal_width())))
         if expected := recording.get("expected"):
@@ -256,6 +256,6 @@ def _show(found: dict[str, Any]) -> None:
                 if error["within_95_pct"] is not None
             )
             echo(f"expected rmse by the fit{source} (share of rows within 95 %): {figures}", "  ")
-    for finding in found.get("findings", ()):
+    for finding in content.get("findings", ()):
         echo(f"\n{finding['message']}")
-    print_verdict(found["verdict"])
+    print_verdict(content["verdict"])

@@ -112,14 +112,9 @@ class WorkPlan:
                 following += 1
 
     def as_finished(
-        self,
-        work: Work,
-        pieces: Sequence[Workload],
-        what: str,
-        *,
-        counted: str = "samples",
+        self, work: Work, pieces: Sequence[Workload], what: str, *, counted: str = "samples",
         lost: Lost | None = None,
-    ) -> Iterator[tuple[int, Any]]:
+    ) -> Iterator[tuple[int, Any]]:  # fmt: skip
         """Process every piece; yield index and result of each as it is finished."""
         report, done = self.progress or ignore_progress, 0
         total = sum(piece.samples for piece in pieces)

@@ -1,9 +1,8 @@
 """The command line as a user meets it: files in, files out, exit codes and messages."""
 
-import io
 import json
 import re
-from contextlib import nullcontext, redirect_stderr, redirect_stdout
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -22,7 +21,9 @@ PLAIN = ("--friction", "viscous+coulomb", "--no-report")
 
 def test_the_written_urdf_predicts_what_the_fit_predicts(arm_logs, tmp_path, capsys):
     fit, keep = (str(arm_logs / f"{name}.csv") for name in ("fit", "keep"))
-    assert main(["identify", ARM, fit, "--validate", keep, "--out", str(tmp_path)]) == 0
+    assert (
+        main(["identify", ARM, fit, "--validate", keep, "--no-report", "--out", str(tmp_path)]) == 0
+    )
     result = json.loads((tmp_path / "result.json").read_text())
     capsys.readouterr()
     assert main(["validate", str(tmp_path / "result.json"), keep, "--json"]) == 0
@@ -34,37 +35,24 @@ def test_the_written_urdf_predicts_what_the_fit_predicts(arm_logs, tmp_path, cap
         assert after["urdf_relative_error_pct"] == pytest.approx(before["urdf_relative_error_pct"])
 
 
-@pytest.fixture(scope="module")
-def alone(arm_logs, tmp_path_factory):
-    """What is printed of one log without another to validate on, and the folder written."""
-    out, printed, said = tmp_path_factory.mktemp("alone"), io.StringIO(), io.StringIO()
+def test_json_is_the_result_alone_and_friction_goes_into_the_urdf(arm_logs, tmp_path, capsys):
+    """Of one log without another to validate on, without a report."""
+    out = tmp_path / "out"
     words = ["identify", ARM, str(arm_logs / "fit.csv"), "--out", str(out), "--json"]
-    with redirect_stdout(printed), redirect_stderr(said):
-        assert main([*words, "--dynamics", *PLAIN]) == 0
-    assert said.getvalue() == ""
-    return json.loads(printed.getvalue()), out
-
-
-def test_friction_goes_into_the_urdf_where_asked(alone):
-    result, out = alone
+    assert main([*words, "--dynamics", *PLAIN]) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    result = json.loads(printed.out)
+    assert result == json.loads((out / "result.json").read_text())
+    assert set(result["outputs"]) == {"urdf", "sidecar"}
+    written = {path.name for path in out.iterdir()}
+    assert written == {"result.json", *result["outputs"].values()}
     value = {p["name"]: p["value"] for p in result["drive_parameters"]}
     text = (out / result["outputs"]["urdf"]).read_text()
     for joint in ("joint_1", "joint_2"):
         (own,) = re.findall(rf'<joint name="{joint}".*?<dynamics (.*?)/>', text, re.DOTALL)
         viscous, coulomb = (value[f"{joint}.{term}"] for term in ("viscous", "coulomb"))
         assert own == f'damping="{viscous!r}" friction="{coulomb!r}"'
-
-
-def test_json_prints_one_object_and_nothing_else(alone):
-    result, out = alone
-    assert result == json.loads((out / "result.json").read_text())
-
-
-def test_no_report_is_written_where_none_is_wanted(alone):
-    result, out = alone
-    assert set(result["outputs"]) == {"urdf", "sidecar"}
-    written = {path.name for path in out.iterdir()}
-    assert written == {"result.json", *result["outputs"].values()}
 
 
 def test_wls_result_without_a_urdf_can_be_validated(arm, arm_logs, tmp_path, capsys):

@@ -88,6 +88,7 @@ def test_a_result_names_recordings_with_their_windows_and_commands_that_work(arm
     assert f"{notes} note{'s' * (notes > 1)} hidden (--verbose)" in flat
     assert "\nnote: " not in said
     assert said.count("\x1b") == 0
+    assert re.search(r"\nnext steps:\n  1\. [^\n]+\n", said)
     commands = re.findall(r"^ {7}(robotid .*)$", said, re.MULTILINE)
     again = shlex.split(commands[0])
     assert any("--gains" in line for line in commands[1:])  # the scale is not verified

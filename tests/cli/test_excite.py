@@ -146,12 +146,15 @@ def test_a_box_is_kept_away_from_and_a_seed_makes_the_same_motion_again(pan_tilt
         quick += ["--harmonics", "2"]
         command = ["excite", str(pan_tilt), "--out", str(out), *quick, "--json", *words]
         assert main(command) == 0
-        return json.loads(capsys.readouterr().out)["limits"]["collision"], out.read_text()
+        return json.loads(capsys.readouterr().out), out.read_text()
 
     wall = ["--box", "post=5,5,5,6,6,6", "--box", "wall=0.06,-1,-1,0.2,1,1"]
-    near, first = designed(*wall, "--seed", "3")
+    content, first = designed(*wall, "--seed", "3")
+    near = content["limits"]["collision"]
     assert near["where"] == "tilt and wall"
     assert near["kept"] == 0.02
+    words = f"{1e3 * near['margin']:5.1f} mm above the clearance of 20 mm, tilt and wall at "
+    assert excite._margin("collision", near) == f"{words}{near['time']:.2f} s"
     # the distance by hand: how far the farthest corner of the cube reaches, turned by b, then by a
     x, y, z = 0.025 * np.stack(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, 8, 1)
     a, b = np.loadtxt(first.splitlines(), delimiter=",", skiprows=1)[:, 1:3].T
@@ -160,8 +163,12 @@ def test_a_box_is_kept_away_from_and_a_seed_makes_the_same_motion_again(pan_tilt
     assert apart - 0.001 <= near["margin"] + near["kept"] <= apart + 1e-6  # a bound to 1 mm
     assert 0.0 <= near["margin"] < 0.01
     # the first motion of the search
-    made = [designed(*wall, "--seed", x, seconds="0.001")[1] for x in ("3", "3", "4")]
-    assert made[0] == made[1] != made[2]
+    made = [designed(*wall, "--seed", x, seconds="0.001") for x in ("3", "3", "4")]
+    assert made[0][1] == made[1][1] != made[2][1]
+    noisy, _ = designed(*wall, "--seed", "3", "--noise", "a=5", seconds="0.001")
+    assert noisy["objective"] != made[0][0]["objective"]
+    low, _ = designed("--floor", "-0.07", seconds="0.001")
+    assert "floor" in low["limits"]["collision"]["where"]
 
 
 def test_a_format_that_motions_are_not_written_in_is_refused_before_the_design(tmp_path, capsys):

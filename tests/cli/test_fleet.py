@@ -52,10 +52,15 @@ def rows_of(folder, **wanted):
     return [row for row in every if all(row[key] == value for key, value in wanted.items())]
 
 
+def identified(table, folder, *names):
+    """Return the logs of some names, and their result by the command line."""
+    logs = [str(table.parent / f"{name}.csv") for name in names]
+    assert main(["identify", str(URDF), *logs, "--out", str(folder), "--no-report"]) == 0
+    return logs, json.loads((folder / "result.json").read_text())
+
+
 def test_a_unit_has_the_result_of_identify(table, done, tmp_path):
-    log = table.parent / "b0.csv"
-    assert main(["identify", str(URDF), str(log), "--out", str(tmp_path), "--no-report"]) == 0
-    result = json.loads((tmp_path / "result.json").read_text())
+    _, result = identified(table, tmp_path, "b0")
     rows = rows_of(done[0], unit="b", status="done")
     expected = {e["name"]: (e["value"], e["std_error"]) for e in result["base_parameters"]}
     assert {row["parameter"]: (row["value"], row["std_error"]) for row in rows} == expected
@@ -64,19 +69,13 @@ def test_a_unit_has_the_result_of_identify(table, done, tmp_path):
 
 
 def test_a_unit_of_three_logs_has_mean_spread_and_the_values_of_its_logs(table, done, tmp_path):
-    logs = [str(table.parent / f"a{k}.csv") for k in range(3)]
-    assert main(["identify", str(URDF), *logs, "--out", str(tmp_path), "--no-report"]) == 0
-    varying = json.loads((tmp_path / "result.json").read_text())["variation"]["parameters"]
-    for name, own in varying.items():
-        (row,) = rows_of(done[0], unit="a", log=None, parameter=name)
-        found = row["value"], row["std_error"], row["spread"]
-        assert found == (own["mean"], own["std_error"], own["spread"])
-        by_log = {row["log"]: row["value"] for row in rows_of(done[0], unit="a", parameter=name)}
-        errors = {
-            row["log"]: row["std_error"] for row in rows_of(done[0], unit="a", parameter=name)
-        }
-        assert [by_log[log] for log in logs] == own["by_log"]
-        assert [errors[log] for log in logs] == own["std_error_by_log"]
+    logs, result = identified(table, tmp_path, "a0", "a1", "a2")
+    for name, varied in result["variation"]["parameters"].items():
+        rows = {row["log"]: row for row in rows_of(done[0], unit="a", parameter=name)}
+        figures = [rows[None][key] for key in ("value", "std_error", "spread")]
+        assert figures == [varied[key] for key in ("mean", "std_error", "spread")]
+        assert [rows[log]["value"] for log in logs] == varied["by_log"]
+        assert [rows[log]["std_error"] for log in logs] == varied["std_error_by_log"]
 
 
 def test_a_failure_is_a_row_and_the_others_are_identified(done, table):

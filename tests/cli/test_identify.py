@@ -135,6 +135,17 @@ def test_a_simulation_finds_in_memory_what_a_job_finds_of_the_same_logs(tmp_path
         assert (entry["start"], entry["end"]) == pytest.approx((log.t[0], log.t[-1]), abs=1e-6)
 
 
+def test_a_simulation_selects_friction_that_is_not_stated(arm, arm_logs, monkeypatch):
+    place, chooses = "robotid.identification.closed_loop.from_commands.identify_loops", []
+    monkeypatch.setattr(place, lambda *_, **stated: chooses.append(stated["chooses"]))
+    for friction in ("auto", "viscous+coulomb"):
+        robotid.identify(
+            arm, arm_logs / "fit.csv", estimator="simulation", controller={"kind": "torque"},
+            friction=friction, doctor=False,
+        )  # fmt: skip
+    assert chooses == [True, False]
+
+
 def test_a_job_file_and_its_settings_in_python_find_the_same(arm, arm_logs, tmp_path):
     urdf, log, job = arm.tree.path, arm_logs / "fit.csv", tmp_path / "job.toml"
     job.write_text(
@@ -181,7 +192,7 @@ def test_a_renamed_project_works(arm, tmp_path, monkeypatch, capsys):
     robotid.write_log(log, old / "logs" / "later.parquet")
     monkeypatch.chdir(old)
     fit = ["robot.urdf", "logs/fit.csv", "--validate", "logs/check.csv", "--out", "out"]
-    assert main(["identify", *fit]) == 0
+    assert main(["identify", *fit, "--no-report"]) == 0
     old.rename(new)
     urdf, result = str(new / "robot.urdf"), str(new / "out")
     monkeypatch.chdir(tmp_path)
@@ -191,7 +202,7 @@ def test_a_renamed_project_works(arm, tmp_path, monkeypatch, capsys):
         ["preview", urdf, str(new / "logs/later.csv"), "--given", result],
         ["replay", urdf, str(new / "logs/later.csv"), result],
         ["export", result, "--format", "mjcf", "--out", str(new / "robot.xml")],
-        ["identify", urdf, str(new / "logs/fit.csv"), "--out", str(new / "again")],
+        ["identify", urdf, str(new / "logs/fit.csv"), "--no-report", "--out", str(new / "again")],
     ):
         assert main(words) == 0, capsys.readouterr().err
     inputs = robotid.load_result(result).content["inputs"]

@@ -77,6 +77,16 @@ def test_logs_of_poses_are_read_whole(arm, arm_logs, dynamics, is_whole):
     assert [log.is_in_memory for (log,) in groups] == [is_whole] * 2
 
 
+def test_of_a_log_its_window_is_read(arm, arm_logs):
+    job, entry = Job(Path(arm.tree.path)), LogEntry(arm_logs / "fit.csv", 1.0, 5.0)
+    t = job.read(entry, arm).t
+    assert (t[0], t[-1]) == (1.0, 5.0)
+    ((log,),) = survey_logs(job, arm, [entry])
+    t = log.whole.trajectory.t
+    assert 1.0 <= t[0] < 1.6
+    assert 4.4 < t[-1] <= 5.0
+
+
 @pytest.mark.parametrize("at", [0, 1, 2])
 def test_a_log_that_alone_has_no_unit_is_named(at):
     entries = [LogEntry(Path(f"{name}.csv"), unit="left") for name in "abc"]

@@ -1,6 +1,7 @@
-"""`robotid payload`: from files to what controllers ask for."""
+"""`robotid payload` and `robotid preview`: what a result and further logs determine."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,7 +30,7 @@ ARM = str(example_urdf("ur5_robot.urdf"))
 
 @pytest.fixture(scope="module")
 def files(ur5, tmp_path_factory):
-    """Logs without and with a load on tool0, as torques and as currents, and a result."""
+    """Logs without and with a load on tool0, as torques, as currents and as motions; a result."""
     folder = tmp_path_factory.mktemp("payload")
     pi, (body, transfer) = truth(ur5), link_transfer(ur5, "tool0")
     loaded = pi.copy()
@@ -39,11 +40,10 @@ def files(ur5, tmp_path_factory):
         log = exact_log(ur5, x, rng, samples=1000, rate=100.0, noise=NOISE)
         log = replace(log, v=None, a=None)
         write_log(log, folder / f"{name}.csv")
-        columns = {"time": log.t}
-        for j, joint in enumerate(ur5.joints):
-            columns[f"q_{joint}"] = log.q[:, j]
-            columns[f"current_{joint}"] = log.tau[:, j] / GAINS[j]
-        write_columns(columns, folder / f"{name}_currents.csv")
+        q = {f"q_{joint}": log.q[:, j] for j, joint in enumerate(ur5.joints)}
+        currents = {f"current_{x}": log.tau[:, j] / GAINS[j] for j, x in enumerate(ur5.joints)}
+        write_columns({"time": log.t} | q | currents, folder / f"{name}_currents.csv")
+        write_columns({"time": log.t} | q, folder / f"{name}_motion.csv")
     table = {"urdf": ARM, "identification": [{"log": "bare.csv"}], "estimator": {"name": "wls"}}
     table["output"] = {"report": False}
     run_job(job_from_settings(table, "job.toml", folder), folder / "out")
@@ -53,8 +53,8 @@ def files(ur5, tmp_path_factory):
 STATED = ("--friction", "viscous+coulomb")  # so that none has to be chosen
 
 
-def asked(capsys, *words, code=0):
-    assert main(["payload", ARM, *map(str, words)]) == code
+def asked(capsys, *words, command="payload", code=0):
+    assert main([command, ARM, *map(str, words)]) == code
     printed = capsys.readouterr()
     return printed.out if code == 0 else printed.err
 
@@ -166,3 +166,99 @@ def test_what_is_missing_is_named(files, capsys):
     finally:
         bare.write_bytes(content)
     assert "is missing or was changed; give a log without the payload" in said
+
+
+def previewed(capsys, *words, code=0):
+    return asked(capsys, *words, command="preview", code=code)
+
+
+def base(content, key="std_error"):
+    return {entry["name"]: entry[key] for entry in content["base_parameters"]}
+
+
+def test_a_motion_without_torques_is_previewed(files, ur5, capsys):
+    words = [f"--noise={j}={s}" for j, s in zip(ur5.joints, NOISE, strict=True)]
+    plain = json.loads(previewed(capsys, files / "bare_motion.csv", "--json", *words[1:]))
+    assert plain["noise"]["elbow_joint"] == {
+        "std": 0.2, "unit": "N m", "correlation": 0.1, "is": "stated",
+    }  # fmt: skip
+    assert plain["noise"]["shoulder_pan_joint"]["std"] == pytest.approx(1.5)
+    assert plain["noise"]["shoulder_pan_joint"]["is"] == "assumed"
+    assert plain["undetermined"] == plain["structure"]["undetermined"]
+    for entry in plain["base_parameters"]:
+        assert 0 < entry["std_error"] <= entry["plausible"] * 1.001
+        assert entry["name"] in entry["expression"]
+    assert {e["source"] for e in plain["standard_parameters"]} <= {"data", "mixed", "prior"}
+    for torque in plain["torque"].values():
+        assert 0 < torque["of_parameters"] < torque["half_width"]
+    whole = json.loads(previewed(capsys, files / "bare.csv", "--velocity", "differentiated",
+                             "--acceleration", "differentiated", "--json", *words[1:]))  # fmt: skip
+    assert base(whole) == base(plain)  # its torques are ignored
+    white = json.loads(previewed(capsys, files / "bare_motion.csv", "--correlation", "0", "--json"))
+    slow = json.loads(previewed(capsys, files / "bare_motion.csv", "--json"))
+    assert sum(base(white).values()) < sum(base(slow).values())
+    motions = [files / "bare_motion.csv", files / "loaded_motion.csv"]
+    both = json.loads(previewed(capsys, *motions, "--json"))
+    assert [motion["path"] for motion in both["motions"]] == list(map(str, motions))
+
+
+def test_the_window_of_a_job_is_previewed(files, capsys):
+    job, log = files / "window.toml", '\n[[identification]]\nlog = "bare_motion.csv"\n'
+    job.write_text(f'urdf = "{ARM}"{log}start = 2.0\nend = 7.0\n')
+    assert main(["preview", str(job), "--json"]) == 0
+    (motion,) = json.loads(capsys.readouterr().out)["motions"]
+    assert 2.0 <= motion["start"] < 2.6
+    assert 6.4 < motion["end"] <= 7.0
+
+
+def test_a_run_before_says_what_gains_most(files, capsys):
+    words = [files / "loaded_motion.csv", "--given", files / "out"]
+    content = json.loads(previewed(capsys, *words, "--json"))
+    assert content["estimator"] == "wls"
+    assert {noise["is"] for noise in content["noise"].values()} == {"found"}
+    before, after, gain = (base(content, k) for k in ("std_error_before", "std_error", "gain"))
+    for name, factor in gain.items():
+        assert factor >= 1.0
+        assert factor <= before[name] / after[name] * 1.001
+    assert max(gain.values()) > 1.3
+    text = previewed(capsys, *words)
+    head, *rows = text.partition("spread\n")[2].splitlines()
+    assert head.split() == ["+-", "left", "before", "gain"]
+    for row, entry in zip(rows, content["base_parameters"], strict=False):
+        left = 100 * min(entry["std_error"] / entry["plausible"], 1)
+        figures = (f"{entry[key]:.2g}" for key in ("std_error_before", "gain"))
+        assert re.split(r" {2,}", row)[-3:] == [f"{left:.0f} %", *figures]
+    assert "assumed" not in text
+
+
+def test_what_was_achieved_stands_beside_what_was_expected(files, capsys):
+    words = [files / "bare.csv", "--given", files / "out"]
+    content = json.loads(previewed(capsys, *words, "--json"))
+    result = json.loads((files / "out" / "result.json").read_text())
+    achieved = base(content, "achieved_std_error")
+    assert achieved == {e["name"]: e["std_error"] for e in result["base_parameters"]}
+    ratio, expected = base(content, "ratio"), base(content)
+    for name, value in ratio.items():
+        assert value == pytest.approx(achieved[name] / expected[name])
+    assert content["achieved"]["count"] == len(ratio)
+    assert content["achieved"]["median"] == pytest.approx(1.0, abs=0.2)
+    assert content["achieved"]["median"] == pytest.approx(np.median([*ratio.values()]))
+    tenths = np.quantile([*ratio.values()], [0.1, 0.9])
+    assert content["achieved"]["range_80"] == pytest.approx(tenths)
+    for joint, noise in content["noise"].items():
+        assert noise["achieved"] == result["identification"]["per_joint"][joint]["rmse"]
+        assert noise["achieved"] == pytest.approx(noise["std"], rel=0.1)
+    assert "times the expected ones" in " ".join(previewed(capsys, *words).split())
+
+
+def test_wrong_words_are_answered(files, capsys):
+    motion = files / "bare_motion.csv"
+    error = previewed(capsys, motion, "--noise", "elbow=1", code=2)
+    assert "Did you mean 'elbow_joint'" in error
+    assert "wanted JOINT=NUMBER" in previewed(capsys, motion, "--noise", "elbow_joint", code=2)
+    error = previewed(capsys, motion, "--given", files / "out", "--cutoff", "5", code=2)
+    assert "a RESULT states how its logs are read" in error
+    write_columns({"time": np.arange(9.0), "q_a": np.zeros(9)}, files / "other_robot.csv")
+    error = previewed(capsys, files / "other_robot.csv", code=1)
+    assert '# q_shoulder_pan_joint = "NAME"' in error
+    assert "tau" not in error

@@ -1,15 +1,13 @@
 """Recordings of other laboratories, identified as a user would: job file in, figures out."""
 
-from dataclasses import replace
-from pathlib import Path
+from functools import cache
 
 import numpy as np
 import pytest
+from helpers.paths import JOBS
 
-from robotid.cli.identify import run_job
-from robotid.cli.job import read_job
+import robotid
 
-JOBS = Path(__file__).parents[1] / "jobs"
 # validation error per joint [%] reached with plain numpy and weighted least squares on the same
 # splits; the figure of WLS may be at most 1.15 times that; the consistent fit, whose prior may cost
 # a joint something, 1.2 times that, and no more than that in the geometric mean
@@ -19,23 +17,17 @@ REACHED = {
     "panda_inria": (5.8, 1.1, 1.9, 0.9, 6.4, 3.2, 15.0),
     "kinova_gen3": (27.0, 11.0, 16.0, 15.0, 19.0, 13.0, 10.0),
 }
-ALL = [*REACHED, "tiago"]
 
 
 @pytest.fixture(scope="module")
-def run(recordings, tmp_path_factory):
-    """Run a job once, with a report where there are gaps; keep what it found and where it wrote."""
-    done = {}
+def run(recordings):
+    """Run a job once."""
 
+    @cache
     def runner(name):
-        if name not in done:
-            with pytest.MonkeyPatch.context() as patch:
-                patch.setenv("ROBOTID_DATA", str(recordings))
-                job = read_job(JOBS / f"{name}.toml")
-            folder = tmp_path_factory.mktemp(name)
-            job = replace(job, report=name == "kinova_gen3")
-            done[name] = (*run_job(job, folder), folder)
-        return done[name]
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("ROBOTID_DATA", str(recordings))
+            return robotid.identify(JOBS / f"{name}.toml")
 
     return runner
 
@@ -47,8 +39,7 @@ def errors(metrics):
 @pytest.mark.parametrize("estimate", ["wls", "estimate"])
 @pytest.mark.parametrize("name", REACHED)
 def test_a_new_motion_is_predicted_as_well_as_plain_numpy_does(run, name, estimate):
-    identification, _, _ = run(name)
-    (kept,) = identification.validation
+    (kept,) = run(name).validation
     ratio = errors(kept.metrics[estimate]) / np.array(REACHED[name])
     assert ratio.max() <= (1.15 if estimate == "wls" else 1.2), ratio
     assert np.exp(np.log(ratio).mean()) <= 1.03, ratio
@@ -56,16 +47,17 @@ def test_a_new_motion_is_predicted_as_well_as_plain_numpy_does(run, name, estima
 
 def test_what_the_data_cannot_say_is_said(run):
     # the wrist currents of TIAGo are a few quanta: no torque information
-    _, result, _ = run("tiago")
-    assert result["verdict"]["status"] == "poor"
-    assert any("worse than a constant" in reason for reason in result["verdict"]["reasons"])
-    _, result, _ = run("ur10e")
+    verdict = run("tiago").verdict
+    assert verdict.status == "poor"
+    assert any("worse than a constant" in reason for reason in verdict.reasons)
+    found = run("ur10e")
     # the friction of its first joint is no line, and that of the next two grows with the load
-    assert result["verdict"]["status"] == "good"
-    assert result["verdict"]["warnings"] == []
-    friction = {joint: found["families"] for joint, found in result["friction"].items()}
-    assert friction["shoulder_pan_joint"] in (["stribeck"], ["tanh"])
-    assert friction["shoulder_lift_joint"] == friction["elbow_joint"] == ["load"]
-    assert friction["wrist_1_joint"] == friction["wrist_3_joint"] == []
-    load = [p["value"] for p in result["drive_parameters"] if p["name"].endswith(".load")]
+    assert found.verdict.status == "good"
+    assert found.verdict.warnings == ()
+    families = {drive.joint.removesuffix("_joint"): drive.families for drive in found.drives}
+    assert families["shoulder_pan"] in (("stribeck",), ("tanh",))
+    assert families["shoulder_lift"] == families["elbow"] == ("load",)
+    assert families["wrist_1"] == families["wrist_3"] == ()
+    values = zip(found.model.layout.names, found.standard, strict=True)
+    load = [value for name, value in values if name.endswith(".load")]
     assert all(0.06 < mu < 0.085 for mu in load)  # six fits of two robots: 0.064 to 0.081

@@ -180,7 +180,8 @@ def test_a_limit_and_a_load_do_what_they_say_and_the_truth_states_it(arm, tmp_pa
     held = np.isclose(np.abs(log.tau), most, rtol=1e-9)
     assert (np.abs(log.tau) <= most * (1 + 1e-9)).all()
     assert held.any()
-    q_ref = SampledMotion(*motion_of(tmp_path / "motion.csv", arm)).evaluate(log.t)[0]
+    motion = read_log(tmp_path / "motion.csv", arm.joints, needs="motion")
+    q_ref = SampledMotion(motion.t, motion.q, motion.v, motion.a).evaluate(log.t)[0]
     error = np.abs(log.q - q_ref)
     assert ((log.q - q_ref).max(axis=0) < error.max(axis=0)).any()  # the largest is a lag
     said = capsys.readouterr().out
@@ -214,9 +215,3 @@ def test_the_torque_of_a_drive_with_a_lag_is_logged_later(arm, tmp_path):
         torques.append(read_log(tmp_path / "log.csv", arm.joints).tau)
     np.testing.assert_array_equal(torques[1][:, 0], torques[0][:, 0])
     np.testing.assert_allclose(torques[1][4:, 1], torques[0][:-4, 1], atol=1e-9)
-
-
-def motion_of(path, model):
-    """Return instants, positions, velocities and accelerations of a motion's table."""
-    log = read_log(path, model.joints, needs="motion")
-    return log.t, log.q, log.v, log.a

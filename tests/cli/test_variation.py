@@ -32,6 +32,7 @@ def settings(folder, units=()):
     return {
         "urdf": str(example_urdf("ur5_robot.urdf")), "joints": list(JOINTS),
         "locked": {"*": 0.0}, "identification": logs, "model": {"friction": "viscous+coulomb"},
+        "output": {"report": False},
     }  # fmt: skip
 
 

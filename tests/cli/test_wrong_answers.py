@@ -11,8 +11,9 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
 from robotid.cli.identify import identify, run_job
-from robotid.cli.job import job_from_settings, read_job
+from robotid.cli.job import job_from_settings
 from robotid.data.files.read import read_log, write_log
+from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.torque import predict
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.output.files.urdf import load_identified, write_urdf
@@ -156,7 +157,7 @@ def continuous_joint(here):
     pi = truth(model)
     log = exact_log(model, pi, np.random.default_rng(2), samples=600, rate=100.0)
     turned = log.q + 2 * np.pi * np.array(turning) * (np.arange(600) >= 300)[:, None]
-    signals = read_job_signals(here)
+    signals = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
     found = identify(
         model, [replace(log, q=turned)], signals=signals, estimator="wls", doctor=False
     )
@@ -165,12 +166,6 @@ def continuous_joint(here):
     assert error < 1e-8
     note = next(note for e in found.fitted for note in e.recording.log.notes if "turn" in note)
     return f"one angle per joint, whatever Pinocchio stores; exact parameters come back; {note}"
-
-
-def read_job_signals(here):
-    path = here.folder / "exact.toml"
-    path.write_text('urdf = "x.urdf"\n[signals]\ncutoff = false\ntrim = 0.0\nmin_velocity = 0.0\n')
-    return read_job(path).signals
 
 
 def missing_mesh(here):
@@ -197,7 +192,7 @@ def outliers(here):
     assert result["verdict"]["status"] == "poor"
     tukey = EstimatorSettings("wls", robust="tukey")
     clean, found = (
-        identify(here.model, [log], estimator=tukey, doctor=False)
+        identify(here.model, [log], estimator=tukey, doctor=False, friction="viscous+coulomb")
         for log in (here.log, replace(here.log, tau=tau))
     )
     assert np.max(np.abs(found.base - clean.base) / clean.base_error) < 1
@@ -229,10 +224,8 @@ def urdf_that_misses_torque(here):
     sidecar = write_urdf(here.model, found.standard, target)
     model, pi = load_identified(target, sidecar)
     motion = found.fitted[0].recording.trajectory
-    shipped, fitted = (
-        predict(model, [pi], motion)[0],
-        predict(here.model, [found.standard], motion)[0],
-    )
+    (shipped,) = predict(model, [pi], motion)
+    (fitted,) = predict(here.model, [found.standard], motion)
     assert np.abs(shipped - fitted).max() < 1e-6 * np.abs(fitted).max()
     return (
         f"what a URDF cannot hold goes to `{sidecar.name}` beside it; both together give the "

@@ -46,11 +46,6 @@ class Case:
         theta = estimate.theta
         return theta if len(theta) == len(self.beta) else self.mapping.to_base(theta)
 
-    def covariance(self, estimate):
-        K = self.mapping.K
-        same = len(estimate.theta) == len(self.beta)
-        return estimate.covariance if same else K @ estimate.covariance @ K.T
-
 
 class RandomStates(Case):
     """The same without noise, from samples that have nothing to do with each other."""

@@ -58,12 +58,6 @@ class Constraints:
     extent: dict[str, Array] = field(default_factory=dict)  # box of all mass, (2, 3) [m]
     relaxed: tuple[str, ...] = ()  # bodies whose extent was removed: the data contradict it
 
-    def without_extent(self, bodies: Iterable[str]) -> "Constraints":
-        """Return the same constraints without the extents of some bodies."""
-        relaxed = tuple(body for body in self.extent if body in set(bodies))
-        others = {body: box for body, box in self.extent.items() if body not in relaxed}
-        return replace(self, extent=others, relaxed=(*self.relaxed, *relaxed))
-
     def check(self, layout: ParameterLayout, prior: Array, held: Array) -> None:
         """Refuse unknown bodies and bounds that contradict each other, before the solver runs."""
         known = {*self.mass, *self.com, *self.extent, *self.pinned}
@@ -238,6 +232,14 @@ class Consistent(BatchEstimator):
         least_squares = wls.estimate(factors.names, wls.covariance, sigma, 0, "")
         return self._minimised(self.rows(factors, sigma), least_squares)
 
+    def without_extent(self, bodies: Iterable[str]) -> "Consistent":
+        """Return the same fit without the extents of some bodies."""
+        bounds, bodies = self.constraints, set(bodies)
+        relaxed = tuple(body for body in bounds.extent if body in bodies)
+        others = {body: box for body, box in bounds.extent.items() if body not in bodies}
+        bounds = replace(bounds, extent=others, relaxed=(*bounds.relaxed, *relaxed))
+        return replace(self, constraints=bounds)
+
     def project(self, estimate: Estimate) -> Estimate:
         """Return the physically consistent standard parameters nearest to an estimate.
 
@@ -257,17 +259,15 @@ class Consistent(BatchEstimator):
     def _minimised(self, rows: Array, base: Estimate) -> Estimate:
         """Return the minimum of rows (k, b + 1), from an estimate of the base parameters."""
         minimum = self.programme.minimise(rows, self.prior_weight)
+        known = self.layout.owned_by(self.constraints.pinned)
+        spread = base_spread(self.K, self.prior_std, known)
         return replace(
-            base,
-            theta=minimum.x,
+            base, theta=minimum.x, names=self.layout.names, message=minimum.message,
             covariance=self.programme.covariance(self.prior_weight, rows, minimum.x),
-            names=self.layout.names,
-            undetermined=self._undetermined(rows, base.names),
-            n_iter=base.n_iter + minimum.n_iter,
-            message=minimum.message,
-            prior_std=self.spread_before,
+            undetermined=determine(base.names, rows[:, :-1], spread).undetermined,
+            n_iter=base.n_iter + minimum.n_iter, prior_std=self.spread_before,
             details=self._details(minimum.x),
-        )
+        )  # fmt: skip
 
     def noise(self, factors: Factors) -> Array:
         """Return the noise levels of weighted least squares without a prior, shape (n,) [N m or N].
@@ -316,12 +316,6 @@ class Consistent(BatchEstimator):
     def _held(self) -> Array:
         """The known part of each body, shape (10 bodies,); 0 without one."""
         return np.zeros(self.layout.n_inertial) if self.held is None else self.held
-
-    def _undetermined(self, rows: Array, base_names: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the base parameters that rows (k, b + 1) do not determine individually."""
-        known = self.layout.owned_by(self.constraints.pinned)
-        before = base_spread(self.K, self.prior_std, known)
-        return determine(base_names, rows[:, :-1], before).undetermined
 
     def _details(self, pi: Array) -> dict[str, Any]:
         """Return the settings of the fit and its active constraints, as plain values."""
@@ -534,7 +528,7 @@ def contradicted_extents(fit: Consistent, segments: Segments) -> tuple[str, ...]
     standard errors and 2 % of the mean square error.
     """
     bounds, rows, count = fit.programme.bounds, segments.rows, len(segments.folds)
-    free = replace(fit, constraints=fit.constraints.without_extent(fit.constraints.extent))
+    free = fit.without_extent(fit.constraints.extent)
     try:
         solution = free.programme.minimise(rows, 1.0, is_exact=False)
     except NotConvergedError:  # bodies diverge: this contradicts no extent
@@ -593,12 +587,9 @@ def log_evidence(fit: Consistent, rows: Array) -> Callable[[float], float]:
 
 
 def _search(
-    score: Callable[[float], tuple[float, Array]],
-    how: str,
-    allowed: float,
-    least: Array | None = None,
-    usual: float = _SMALLEST,
-) -> WeightChoice:
+    score: Callable[[float], tuple[float, Array]], how: str, allowed: float,
+    least: Array | None = None, usual: float = _SMALLEST,
+) -> WeightChoice:  # fmt: skip
     """Return the largest weight that ``_is_accepted`` in comparison with that of smallest score.
 
     ``score`` returns the score and its parts by segment and joint, or none. Below the usual

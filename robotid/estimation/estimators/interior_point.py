@@ -309,15 +309,9 @@ class Programme:
         return _Point(x, t[:, :, None, None] * inverse.mT @ inverse, s, mu / s)
 
     def redrawn(
-        self,
-        rows: Array,
-        weight: float,
-        pi: Array,
-        meat: Array,
-        weight_ratio: float,
-        draws: int,
+        self, rows: Array, weight: float, pi: Array, meat: Array, weight_ratio: float, draws: int,
         rng: np.random.Generator,
-    ) -> tuple[Array, list[str]]:
+    ) -> tuple[Array, list[str]]:  # fmt: skip
         """Return the distances (m, p) of fits to resampled data and prior, and failures.
 
         Noise of the data has the covariance of their score, meat (b, b), that of the prior the
@@ -484,12 +478,9 @@ class _System:
         )  # fmt: skip
 
     def direction(
-        self,
-        t: Array | float,
-        mu: Array | float,
-        cross: Array | None = None,
+        self, t: Array | float, mu: Array | float, cross: Array | None = None,
         pairs: Array | float = 0.0,
-    ) -> _Direction:
+    ) -> _Direction:  # fmt: skip
         """Return the steps to Z J = t 1, lambda s = mu: t, mu (f, 1), cross as J, pairs as s."""
         point, length, size = self.point, self.length, self.problem.inertial
         bodies = np.zeros_like(self.R_inverse)  # sum of the changes of J and Z, plus diag(l)

@@ -235,13 +235,9 @@ class OutputError(Estimator[Simulator]):
         return _summed(simulator, theta, linearised(simulator, weights, theta, frees=frees))
 
     def _descend(
-        self,
-        simulator: Simulator,
-        weights: _Weights,
-        theta: Array,
-        residuals: Sequence[Residual],
+        self, simulator: Simulator, weights: _Weights, theta: Array, residuals: Sequence[Residual],
         close: float,
-    ) -> tuple[Array, Sequence[Residual], int, bool]:
+    ) -> tuple[Array, Sequence[Residual], int, bool]:  # fmt: skip
         """Return the minimum with fixed weights, its residuals, steps, and if it converged."""
         damping, cost = _CAUTIOUS, self._cost(simulator, weights, theta, residuals)
         if not np.isfinite(cost):
@@ -275,15 +271,9 @@ class OutputError(Estimator[Simulator]):
         return theta, residuals, self.steps, False
 
     def _estimate(
-        self,
-        simulator: Simulator,
-        weights: _Weights,
-        theta: Array,
-        residuals: Sequence[Residual],
-        how: Mapping[str, Any],
-        *,
-        moves: bool = False,
-    ) -> Estimate:
+        self, simulator: Simulator, weights: _Weights, theta: Array, residuals: Sequence[Residual],
+        how: Mapping[str, Any], *, moves: bool = False,
+    ) -> Estimate:  # fmt: skip
         """Return the estimate, after a step if it ``moves``; errors are from scores of segments."""
         parts = list(_whitened(residuals, weights, frees=True))
         rows = sum(r.e.size for r in residuals)
@@ -310,11 +300,9 @@ class OutputError(Estimator[Simulator]):
         # standard errors are at least those for independent rows
         independent = np.diag(bread @ H @ bread.T)
         gained = 1.0 - independent * known  # relative reduction of each prior variance
-        undetermined = tuple(
-            name for name, share in zip(simulator.names, gained, strict=True) if share < _LOST
-        )
-        theta = theta + change
-        at_bound = np.array(simulator.names)[is_at_bound(simulator, theta)]
+        names, theta = np.array(simulator.names), theta + change
+        undetermined = tuple(names[gained < _LOST].tolist())
+        at_bound = tuple(names[is_at_bound(simulator, theta)].tolist())
         return Estimate(
             theta=theta,
             covariance=at_least(sandwich(bread, meat + np.diag(known)), independent),
@@ -325,13 +313,11 @@ class OutputError(Estimator[Simulator]):
             undetermined=undetermined,
             prior_std=simulator.prior_std,
             details={
-                "correlation": weights.rho,
-                "inflation": inflation * self.inflation,
-                "freedom": freedom,
-                "at_bound": tuple(at_bound.tolist()),
+                "correlation": weights.rho, "inflation": inflation * self.inflation,
+                "freedom": freedom, "at_bound": at_bound,
             },
             **how,
-        )
+        )  # fmt: skip
 
 
 def _summed(

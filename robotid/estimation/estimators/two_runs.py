@@ -259,17 +259,10 @@ def _of_joint(factors: Factors, joint: int) -> Factors:
 
 
 def payload_runs(
-    reference: Sequence[Reduction],
-    loaded: Sequence[Reduction],
-    layout: ParameterLayout,
-    K: Array,
-    urdf: Array,
-    spread: Array,
-    payloads: tuple[Array, Array, Array],
-    *,
-    share: float,
+    reference: Sequence[Reduction], loaded: Sequence[Reduction], layout: ParameterLayout, K: Array,
+    urdf: Array, spread: Array, payloads: tuple[Array, Array, Array], *, share: float,
     unknown: Sequence[int] = (),
-) -> TwoRuns:
+) -> TwoRuns:  # fmt: skip
     """Return the comparison of a run without and a run with payloads.
 
     Friction and offsets differ, as they change with load and temperature, inertias do not. Payloads

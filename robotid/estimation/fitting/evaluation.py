@@ -85,28 +85,20 @@ class TorqueSums:
         def squares(values: Array) -> Array:
             return np.asarray(np.sum(values**2, axis=0, where=mask))
 
-        return cls(
-            rows=rows,
-            mean=mean,
-            spread=squares(tau - mean),
-            torque=squares(tau),
-            residual=squares(tau - prediction),
-            baselines={name: squares(tau - torque) for name, torque in baselines.items()},
-        )
+        others = {name: squares(tau - torque) for name, torque in baselines.items()}
+        return cls(rows, mean, squares(tau - mean), squares(tau), squares(tau - prediction), others)
 
     def merge(self, other: "TorqueSums") -> "TorqueSums":
         """Return the sums over the rows of both (Chan, Golub, LeVeque, 1983, variance, (2.1))."""
         rows = self.rows + other.rows
         share = other.rows / np.maximum(rows, 1)
         step = other.mean - self.mean
+        mean, between = self.mean + share * step, step**2 * self.rows * share
+        baselines = {name: x + other.baselines[name] for name, x in self.baselines.items()}
         return TorqueSums(
-            rows=rows,
-            mean=self.mean + share * step,
-            spread=self.spread + other.spread + step**2 * self.rows * share,
-            torque=self.torque + other.torque,
-            residual=self.residual + other.residual,
-            baselines={name: x + other.baselines[name] for name, x in self.baselines.items()},
-        )
+            rows, mean, self.spread + other.spread + between, self.torque + other.torque,
+            self.residual + other.residual, baselines,
+        )  # fmt: skip
 
     def metrics(self, names: Sequence[str], units: Sequence[str]) -> Metrics:
         """Return the metrics computed from the sums."""
@@ -121,14 +113,12 @@ class TorqueSums:
     def _joint(self, j: int, unit: str) -> JointMetrics:
         residual, spread = float(self.residual[j]), float(self.spread[j])
         return JointMetrics(
-            rmse=float(np.sqrt(residual / self.rows[j])),
-            unit=unit,
+            rmse=float(np.sqrt(residual / self.rows[j])), unit=unit, rows=int(self.rows[j]),
             relative_error_pct=self._relative_error(j, residual),
             r2=1.0 - residual / spread if spread > 0 else 0.0,
-            rows=int(self.rows[j]),
             baselines={x: self._relative_error(j, float(s[j])) for x, s in self.baselines.items()},
             better_than_constant=residual < spread,
-        )
+        )  # fmt: skip
 
     def _relative_error(self, j: int, residual: float) -> float | None:
         return 100.0 * float(np.sqrt(residual / self.torque[j])) if self.torque[j] > 0 else None
@@ -309,15 +299,9 @@ def _score_logs(
 
 
 def _score(
-    piece: LogPiece,
-    threads: int | None,
-    *,
-    parameters: Mapping[str, Array],
-    prior: Array | None,
-    driven: Array | None,
-    sought: Sequence[Array] = (),
-    shown_rows: slice | None = None,
-) -> _Score:
+    piece: LogPiece, threads: int | None, *, parameters: Mapping[str, Array], prior: Array | None,
+    driven: Array | None, sought: Sequence[Array] = (), shown_rows: slice | None = None,
+) -> _Score:  # fmt: skip
     """Return the result of a piece, with the torques of the rows that are shown."""
     rows, model = piece.read(), piece.model
     motion, mask = rows.trajectory, rows.mask
@@ -338,14 +322,11 @@ def _score(
     every = _sampled_every(stop - first)
     return _Score(
         sums={x: TorqueSums.of(motion.tau, torques[x], measured, baselines) for x in parameters},
-        smooth=len(motion.t),
-        used=int(mask.sum()),
+        smooth=len(motion.t), used=int(mask.sum()), turned=rows.turned, shown=shown,
         segments=frozenset(np.unique(motion.segment).tolist()),
-        turned=rows.turned,
-        shown=shown,
         sampled=recorded[(first - piece.first) % every :: every],
         found=tuple(_rows_in(sampled, recorded) for sampled in sought),
-    )
+    )  # fmt: skip
 
 
 def _shown_rows(piece: LogPiece) -> slice | None:
@@ -359,12 +340,9 @@ def _shown_rows(piece: LogPiece) -> slice | None:
 
 
 def _predict_all(
-    model: RobotModel,
-    trajectory: Trajectory,
-    parameters: Mapping[str, Array],
-    prior: Array | None,
-    compiled: bool | None,
-) -> dict[str, Array]:
+    model: RobotModel, trajectory: Trajectory, parameters: Mapping[str, Array],
+    prior: Array | None, compiled: bool | None,
+) -> dict[str, Array]:  # fmt: skip
     """Return the torques by each set of parameters and by the URDF's gravity, (N, n_rows) each."""
     names = [*parameters] if prior is None else [*parameters, "gravity_only"]
     if not len(trajectory.t) or not names:
@@ -384,15 +362,13 @@ def _evaluation_of(
     """Return the evaluation of a log from the results of its pieces."""
     shown = [score.shown for score in scores if score.shown is not None]
     motions, masks, torques = zip(*shown, strict=True)
+    start, end = (float(log.stamps[k]) for k in (log.first, log.stop - 1))
     extent = Extent(
-        samples=log.stop - log.first,
-        rate=1.0 / log.step,
-        start=float(log.stamps[log.first]),
-        end=float(log.stamps[log.stop - 1]),
+        log.stop - log.first, 1.0 / log.step, start, end,
         smooth=sum(score.smooth for score in scores),
         rows_used=sum(score.used for score in scores),
         segments=len(frozenset.union(*(score.segments for score in scores))),
-    )
+    )  # fmt: skip
     head, model = log.head, log.model
     turned = np.any([score.turned for score in scores], axis=0)
     if turned.any():

@@ -151,12 +151,12 @@ def consistent_fit(choice: BoundedSettings, known: Known) -> Consistent:
         return fit
     segments = Segments.of(fit, folds)
     if extent and (beyond := contradicted_extents(fit, segments)):
-        fit = replace(fit, constraints=fit.constraints.without_extent(beyond))
+        fit = fit.without_extent(beyond)
     if not how:
         return fit
     weight = choose_weight(fit, segments, how, known.repeated)
     if fit.constraints.extent and weight.loss > AS_GOOD:
-        unbound = replace(fit, constraints=fit.constraints.without_extent(fit.constraints.extent))
+        unbound = fit.without_extent(fit.constraints.extent)
         if AS_GOOD * loss_of(unbound, segments, weight.weight) < weight.loss:
             fit, weight = unbound, choose_weight(unbound, segments, how, known.repeated)
     return replace(
@@ -235,13 +235,9 @@ class Solved:
         logs = self.recordings
         fitted, validation = evaluate_logs(logs.fitted, logs.validation, {}, None, plan=logs.plan)
         return Solution(
-            model=logs.model,
-            mapping=logs.mapping,
-            prior_std=self.prior_std,
-            standard=self.standard,
-            fitted=fitted,
-            validation=validation,
-        )
+            model=logs.model, mapping=logs.mapping, prior_std=self.prior_std,
+            standard=self.standard, fitted=fitted, validation=validation,
+        )  # fmt: skip
 
     def with_errors(self) -> Fit:
         """Return the fit: the parameters with their standard errors and predictions."""
@@ -262,28 +258,15 @@ class Solved:
         sums = self._sums()
         _, unit = np.unique([log.unit for log in logs.fitted], return_inverse=True)
         fit = Fit(
-            model=logs.model,
-            mapping=mapping,
-            estimator=self.choice,
-            estimate=estimate,
-            wls=wls,
-            prior=before.pi,
-            urdf_with_drives=driven,
-            prior_std=self.prior_std,
-            standard=self.standard,
-            standard_covariance=covariance,
-            base=mapping.to_base(self.standard),
-            base_error=base_error,
-            fitted=fitted,
-            validation=validation,
-            errors=errors,
-            factors=ground.factors,
-            determination=ground.determination,
-            regressor_noise=ground.noise,
-            sums=sums,
+            model=logs.model, mapping=mapping, estimator=self.choice, estimate=estimate, wls=wls,
+            prior=before.pi, urdf_with_drives=driven, prior_std=self.prior_std,
+            standard=self.standard, standard_covariance=covariance,
+            base=mapping.to_base(self.standard), base_error=base_error,
+            fitted=fitted, validation=validation, errors=errors, factors=ground.factors,
+            determination=ground.determination, regressor_noise=ground.noise, sums=sums,
             runs=() if sums is None else runs_of(logs.model, mapping, self.standard, sums, unit),
             left_out=self._left_out(fitted),
-        )
+        )  # fmt: skip
         is_hidden = (K[:, ~fit.at_bound] == 0).all(axis=1)  # sums of terms at bounds only
         return replace(fit, base_error=np.where(is_hidden, np.inf, base_error))
 
@@ -462,13 +445,11 @@ def _without_regressor_noise(ground: _Ground, choice: EstimatorSettings) -> _Gro
         return replace(ground, noise=noise)
     logs = tuple(tuple(part.without(noise.shift) for part in log) for log in ground.logs)
     return replace(
-        ground,
+        ground, logs=logs, noise=noise,
         reduction=replace(ground.reduction, factors=ground.factors.without(noise.shift)),
         before=replace(ground.before, held_out=tuple(chain.from_iterable(logs))),
-        logs=logs,
         rough=replace(ground.rough, theta=theta - noise.shift),
-        noise=noise,
-    )
+    )  # fmt: skip
 
 
 def _run(

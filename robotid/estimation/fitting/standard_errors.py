@@ -44,18 +44,10 @@ class StandardErrors:
 
 
 def measured_errors(
-    estimate: Estimate,
-    segments: Sequence[Factors],
-    factors: Factors,
-    share: float,
-    K: Array,
-    sigma: Array,
-    *,
-    is_filter: bool = False,
-    weight_ratio: float = 1.0,
-    bounded: Consistent | None = None,
-    more: Array | None = None,
-) -> tuple[Estimate, StandardErrors]:
+    estimate: Estimate, segments: Sequence[Factors], factors: Factors, share: float, K: Array,
+    sigma: Array, *, is_filter: bool = False, weight_ratio: float = 1.0,
+    bounded: Consistent | None = None, more: Array | None = None,
+) -> tuple[Estimate, StandardErrors]:  # fmt: skip
     """Return an estimate with its covariance from the scatter of the segments.
 
     With the bread B, the covariance if rows were independent, and the meat M, the covariance of the
@@ -113,13 +105,10 @@ def with_wls_errors(estimate: Estimate, wls: Estimate) -> Estimate:
     covariance = wls.covariance + np.outer(distance, distance)
     reason = "standard errors are those of wls plus the distance to it"
     return replace(
-        estimate,
-        covariance=covariance,
-        rank=wls.rank,
-        condition=wls.condition,
+        estimate, covariance=covariance, rank=wls.rank, condition=wls.condition,
         undetermined=wls.undetermined,
         message=estimate.message.split("; a gradient method")[0] + f"; {reason}",
-    )
+    )  # fmt: skip
 
 
 def standard_of(
@@ -147,13 +136,9 @@ def about_prior(
 
 
 def _redrawn(
-    estimate: Estimate,
-    errors: StandardErrors,
-    fit: Consistent,
-    factors: Factors,
-    sigma: Array,
+    estimate: Estimate, errors: StandardErrors, fit: Consistent, factors: Factors, sigma: Array,
     meat: Array,  # (b, b), covariance of the score of the rows of ``Consistent.rows``
-) -> tuple[Estimate, StandardErrors]:
+) -> tuple[Estimate, StandardErrors]:  # fmt: skip
     """Return the estimate with the mean square distance of resampled fits as its covariance."""
     rows, rng = fit.rows(factors, sigma), np.random.default_rng(0)
     distances, failures = fit.programme.redrawn(

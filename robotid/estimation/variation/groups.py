@@ -93,12 +93,9 @@ class RunSums:
 
 
 def sums_of(
-    model: RobotModel,
-    mapping: BaseMapping,
-    segments: Sequence[Sequence[Factors]],
-    standard: Array,
-    sigma: Array,
-) -> RunSums:
+    model: RobotModel, mapping: BaseMapping, segments: Sequence[Sequence[Factors]],
+    standard: Array, sigma: Array,
+) -> RunSums:  # fmt: skip
     """Return the sums of runs over all groups of parameters: standard (p,), sigma (n,)."""
     theta, groups = mapping.to_base(standard), [g for g, _ in groups_at(model, mapping, standard)]
     products = [_products(run, groups, theta, sigma) for run in segments]

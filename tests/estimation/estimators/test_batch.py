@@ -34,21 +34,6 @@ def test_what_the_data_do_not_excite_is_refused_by_name(ur5, rng, estimator):
     assert f"the data excite {caught.value.rank} of 58 base parameters" in str(caught.value)
 
 
-def test_with_a_prior_the_rest_is_kept(ur5, rng):
-    case = still_wrist(ur5, rng)
-    prior = case.mapping.to_base(ur5.standard_parameters())
-    estimate = WLS(prior=prior).fit(case.problem)
-    other = WLS(prior=prior + 1e-3 * np.abs(prior)).fit(case.problem)
-    factors = compress(case.problem)
-    np.testing.assert_allclose(  # what the data determine has nothing of the prior
-        factors.residual_squares(other.theta), factors.residual_squares(estimate.theta), rtol=1e-6
-    )
-    i = estimate.names.index("wrist_3_joint.viscous")
-    assert estimate.theta[i] == pytest.approx(prior[i], abs=1e-12)
-    assert np.isinf(estimate.std_error[i])
-    assert estimate.rank < 58
-
-
 @pytest.mark.parametrize("share", [1.0, 0.2])
 def test_covariances_are_their_formulas(rng, share):
     Y = rng.standard_normal((40, 2, 3))

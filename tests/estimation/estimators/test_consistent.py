@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import scipy.stats
 from helpers.estimation import NOISE, Case, consistent
-from helpers.synthetic import truth
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.dynamics.factors import Factors, compress, triangle_of
@@ -129,25 +128,6 @@ def test_a_known_total_mass_is_met_exactly(case):
     one = np.zeros(len(fit.prior))
     one[:60:10] = 1.0
     assert one @ estimate.covariance @ one == pytest.approx(0.0, abs=1e-12)
-
-
-def test_pinned_bodies_keep_the_urdf_and_the_rest_is_the_constrained_least_squares(case, ur5):
-    fit, factors = case
-    estimate = constrained(fit, pinned=("forearm_link", "wrist_1_link")).fit(factors)
-    np.testing.assert_allclose(estimate.theta[20:40], fit.prior[20:40], rtol=1e-12, atol=1e-12)
-    assert not estimate.std_error[20:40].any()
-    # all others are at a minimum, where no inequality binds
-    fit = replace(fit, prior=truth(ur5), prior_weight=10.0)
-    pinned = constrained(fit, pinned=("forearm_link", "wrist_1_link"))
-    estimate = pinned.fit(factors)
-    assert estimate.details["active"] == []
-    rows = pinned.rows(factors, estimate.sigma)
-    D = rows[:, :-1] @ fit.K
-    slope = D.T @ (D @ estimate.theta - rows[:, -1])
-    slope += 0.5 * fit.prior_weight * fit.programme.penalty.gradient(estimate.theta)
-    kept = np.setdiff1d(np.arange(len(fit.prior)), np.arange(20, 40))
-    slope *= fit.prior_std
-    assert np.abs(slope[kept]).max() < 1e-5 * np.abs(slope).max()
 
 
 def test_without_noise_a_redrawn_fit_is_the_fit_at_its_bounds(case, rng):

@@ -11,11 +11,11 @@ from robotid.estimation.fitting.evaluation import (
     _joined,
     evaluate_logs,
     hidden_joints,
-    pool,
     predict,
     shares_rows,
 )
 from robotid.estimation.fitting.recorded import hold_log
+from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
@@ -35,9 +35,8 @@ def test_baselines_are_the_urdf_with_and_without_motion(ur5, rng):
     np.testing.assert_allclose(found.torques["truth"], recording.trajectory.tau, atol=1e-10)
     (urdf,) = predict(ur5, [prior], recording.trajectory)
     np.testing.assert_allclose(found.torques["urdf"], urdf, rtol=1e-12, atol=1e-12)
-    assert (
-        np.abs(found.torques["gravity_only"][:, 0]).max() < 1e-9
-    )  # a vertical axis carries no weight
+    # a vertical axis carries no weight
+    assert np.abs(found.torques["gravity_only"][:, 0]).max() < 1e-9
     measured = found.metrics["truth"].per_joint["elbow_joint"]
     assert measured.relative_error_pct < 1e-9
     assert measured.baselines["gravity_only"] > 10
@@ -58,14 +57,6 @@ def test_each_kept_log_is_looked_for_in_each_fitted_one(ur5, rng):
     for fitted in ([a, b], [b, a]):
         _, kept = evaluate_logs(fitted, [b, new, a], {}, None)
         assert [e.is_refitted for e in kept] == [True, False, True]
-
-
-def test_pooled_metrics_are_those_of_all_rows(ur5, rng):
-    pi = truth(ur5)
-    logs = [exact_log(ur5, pi, rng, noise=np.full(6, s), samples=200) for s in (0.1, 0.3)]
-    found = [evaluated(ur5, log, {"x": pi}, pi) for log in logs]
-    squares = [f.metrics["x"].pooled_rmse ** 2 for f in found]
-    np.testing.assert_allclose(pool(ur5, found, "x").pooled_rmse, np.sqrt(np.mean(squares)))
 
 
 def test_joints_are_hidden_whose_torque_changes_less_over_the_rows_used_than_is_left():
@@ -92,8 +83,6 @@ def test_joints_are_hidden_whose_torque_changes_less_over_the_rows_used_than_is_
 
 
 def test_rows_of_slow_joints_and_slow_coupled_drives_are_left_out(ur5, rng):
-    from robotid.robot.model import RobotModel
-
     coupling = Coupling("motor", (("wrist_2_joint", 1.0), ("wrist_3_joint", 1.0)))
     coupled = RobotModel.from_urdf(ur5.tree.path, couplings=(coupling,))
     trajectory = hold_log(ur5, exact_log(ur5, truth(ur5), rng), EXACT).whole.trajectory

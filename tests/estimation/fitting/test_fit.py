@@ -54,17 +54,6 @@ def test_the_prior_of_a_fit_has_the_scale_of_the_samples_of_all_logs(rng):
     np.testing.assert_allclose(found.wls.theta, found.estimate.theta, rtol=1e-6)
 
 
-def test_the_drives_of_a_true_urdf_are_found_exactly(ur5, rng):
-    pi = ur5.standard_parameters()
-    size = ur5.layout.n_inertial
-    pi[size:] = truth(ur5)[size:]
-    log = exact_log(ur5, pi, rng)
-    found = fit(ur5, [log], validation=[log], signals=EXACT, estimator="wls")
-    np.testing.assert_allclose(found.urdf_with_drives, pi, rtol=1e-6, atol=1e-8)
-    measured = found.metrics().per_joint["elbow_joint"]
-    assert measured.baselines["urdf_with_drives"] < 1e-5 < measured.baselines["urdf"]
-
-
 def test_drives_beside_the_urdf_are_those_of_bounded_least_squares_on_all_rows(ur5, rng):
     size = ur5.layout.n_inertial
     log = exact_log(ur5, truth(ur5), rng, noise=np.full(6, 0.3))

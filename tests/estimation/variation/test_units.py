@@ -48,16 +48,6 @@ def test_a_value_with_a_large_error_is_not_unlike():
     assert [k for k, _ in between_units(x, errors, 1e-3)[1]] == [5]
 
 
-def test_a_unit_of_precise_values_has_the_probability_of_the_t_test():
-    rng = np.random.default_rng(4)
-    x = np.insert(7.0 + 0.2 * rng.normal(size=8), 3, 8.1)
-    p = scipy.stats.ttest_ind(np.delete(x, 3), x[3:4]).pvalue
-    errors = np.full(9, 1e-4)
-    assert between_units(x, errors, 0.9 * p)[1] == ()
-    (found,) = between_units(x, errors, 1.1 * p)[1]
-    assert found == (3, pytest.approx(p, rel=0.05))
-
-
 def test_the_probability_is_that_of_weighted_least_squares_over_all_spreads():
     """Dense: at each s, x = mu + delta [last] with covariance s^2 + e^2; restricted likelihoods."""
     rng = np.random.default_rng(3)

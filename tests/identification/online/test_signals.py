@@ -1,7 +1,13 @@
 import numpy as np
 import pytest
 
-from robotid.identification.online import LiveSignals
+from robotid.identification.online import (
+    ChangeDetector,
+    Innovations,
+    LiveSignals,
+    load_spread,
+    payload_of,
+)
 
 FIXED = np.array([False])
 
@@ -71,3 +77,95 @@ def test_full_turns_are_taken_out_of_joints_that_turn_freely():
     np.testing.assert_allclose(both[2][:, 0], v[:, 0], atol=1e-9)
     np.testing.assert_allclose(both[2][:, 1], alone[2][:, 0], atol=1e-9)
     assert np.abs(alone[2]).max() > 50.0
+
+
+def test_noise_alone_is_no_change_and_a_shift_is_flagged_where_it_began(rng):
+    detector = ChangeDetector(3, 40.0)
+    for k in range(20_000):
+        assert detector.push(k * 0.1, rng.standard_normal(3) ** 2, 1.0) is None
+    flagged = None
+    for k in range(20_000, 20_100):
+        e = rng.standard_normal(3) + np.array([0.0, 4.0, 0.0])
+        flagged = detector.push(k * 0.1, e**2, 1.0)
+        if flagged is not None:
+            break
+    assert flagged == pytest.approx(2000.0, abs=0.3)
+    assert k - 20_000 < 10
+    np.testing.assert_array_equal(detector.evidence, 0.0)
+
+
+def innovations(n=1, model_error=0.0):
+    return Innovations(np.full(n, 10.0), 0.01, model_error, ChangeDetector(n, 40.0))
+
+
+def test_a_row_that_is_not_used_teaches_nothing():
+    monitor = innovations(2)
+    before = monitor.variance.copy()
+    e = np.array([100.0, 0.01])
+    monitor.push(0.0, e, e, e, np.zeros(2), np.array([False, True]), 1.0)
+    assert monitor.variance[0] == before[0]
+    assert monitor.variance[1] < before[1]
+    assert np.isinf(monitor.ratio[0])
+    # one row that is open is enough not to have converged
+    assert monitor.ratio[1] == 0.0
+    assert not monitor.is_converged
+    monitor.push(0.01, e, e, e, np.zeros(2), np.array([True, False]), 1.0)
+    assert monitor.is_converged
+
+
+@pytest.mark.parametrize(("model_error", "is_flagged"), [(0.0, True), (0.1, False)])
+def test_what_a_model_may_miss_is_no_change(model_error, is_flagged):
+    monitor, used = innovations(model_error=model_error), np.array([True])
+    flagged, tau = False, np.array([10.0])
+    for k in range(500):
+        monitor.push(0.01 * k, tau, 0.1 * np.ones(1), 0.1 * np.ones(1), np.zeros(1), used, 0.2)
+    for k in range(500, 700):
+        e = np.ones(1)  # a tenth of the torque
+        flagged |= monitor.push(0.01 * k, tau, e, e, np.zeros(1), used, 0.2) is not None
+    assert flagged is is_flagged
+
+
+def test_the_noise_and_what_the_parameters_leave_open_are_their_recursions(rng):
+    rms, dt, memory, model_error = np.array([10.0, 3.0]), 0.05, 5.0, 0.2
+    detector = ChangeDetector(2, 1e9)
+    monitor = Innovations(rms, dt, model_error, detector)
+    variance, torque, seen = 0.01 * rms**2, rms**2, np.full(2, 20.0)
+    open_, evidence = np.full(2, np.inf), np.zeros(2)
+    for k in range(160):
+        used = rng.uniform(size=2) < 0.8
+        tau, e, residual = rng.standard_normal((3, 2)) * [[8.0, 2.0]]
+        doubt = rng.uniform(0.0, 0.45, 2) * variance
+        for j in range(2):
+            expected = doubt[j] + variance[j] + model_error**2 * torque[j]
+            if used[j] and open_[j] < 0.25:
+                more = 0.3 * (min(e[j] ** 2 / expected, 25.0) - 4.0)
+                evidence[j] = max(evidence[j] + more, 0.0)
+        monitor.push(dt * k, tau, e, residual, doubt, used, 0.3)
+        for j in np.flatnonzero(used):
+            product = np.clip(e[j] * residual[j], 0.0, 9.0 * (doubt[j] + variance[j]))
+            ratio = doubt[j] / variance[j]
+            seen[j] = min(seen[j] + 1.0, memory / dt)
+            torque[j] += (tau[j] ** 2 - torque[j]) / seen[j]
+            variance[j] += (product - variance[j]) / seen[j]
+            open_[j] = ratio if np.isinf(open_[j]) else open_[j] + dt * (ratio - open_[j])
+        np.testing.assert_allclose(monitor.variance, variance)
+        np.testing.assert_allclose(monitor.ratio, open_)
+        np.testing.assert_allclose(detector.evidence, evidence)
+        assert monitor.is_converged == (open_ < 0.25).all()
+    assert evidence.max() > 0.0
+    assert monitor.is_converged
+    monitor.forget_convergence()
+    assert not monitor.is_converged
+
+
+def test_a_load_is_the_generalised_least_squares_of_its_change_about_none(rng):
+    columns, root = rng.standard_normal((30, 10)), rng.standard_normal((30, 30))
+    C, spread = 0.1 * root @ root.T, np.linspace(0.5, 3.0, 10)
+    change = rng.standard_normal(30)
+    found = payload_of(change, C, columns, spread)
+    H = np.diag(spread**-2.0) + columns.T @ np.linalg.solve(C, columns)
+    wanted = np.linalg.solve(H, columns.T @ np.linalg.solve(C, change))
+    np.testing.assert_allclose(found.parameters, wanted)
+    np.testing.assert_allclose(found.std_error, np.sqrt(np.diag(np.linalg.inv(H))))
+    bodies = np.concatenate([[4.0, *[1.0] * 9], [2.0, 0.2, 0.6, 0.1, *[1.0] * 6]])
+    np.testing.assert_allclose(load_spread(bodies), 3.0 * np.repeat([1.0, 0.6, 0.36], [1, 3, 6]))
