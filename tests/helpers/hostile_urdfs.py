@@ -1,6 +1,6 @@
 """Hostile URDFs of every kind, and what is done with each: a traceback is a failure.
 
-``tests/robot/test_hostile_urdfs.py`` tries some, ``benchmarks/bench_fuzz.py`` thousands.
+``tests/robot/test_model.py`` tries some, ``benchmarks/bench_fuzz.py`` thousands.
 """
 
 import contextlib

@@ -128,11 +128,8 @@ ESTIMATE = Estimate(
 )
 
 
-def test_each_parameter_has_its_own_error():
+def test_each_parameter_has_its_own_error_and_students_quantile():
     np.testing.assert_array_equal(ESTIMATE.std_error, ERROR)
-
-
-def test_intervals_reach_students_quantile():
     np.testing.assert_allclose(ESTIMATE.quantile, 1.959964, rtol=1e-6)
     few = replace(ESTIMATE, details={"freedom": np.array([12.0, 4.0, np.inf])})
     np.testing.assert_allclose(few.quantile, [2.178813, 2.776445, 1.959964], rtol=1e-6)
