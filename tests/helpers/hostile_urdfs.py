@@ -22,8 +22,6 @@ from robotid.robot.bodies import body_boxes
 from robotid.robot.mass_matrix import check_mass_matrix
 from robotid.robot.model import RobotModel
 
-__all__ = ["HostileUrdf", "run_urdf", "urdf_inputs"]
-
 LONGEST = 20_000  # characters of a message: longer ones are no words
 
 
