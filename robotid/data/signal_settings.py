@@ -305,11 +305,6 @@ class Transmission(Settings):
         return np.diag(T) if T.ndim == 1 else T
 
     @property
-    def to_torque(self) -> Array:
-        """Matrix from motor torques to joint torques, T^T diag(efficiency), shape (n, n)."""
-        return self.T.T * (self.efficiency or 1.0)
-
-    @property
     def shared(self) -> dict[str, tuple[tuple[str, float], ...]]:
         """Joints and ratios, over the largest, of each shared motor, by the joint in its place."""
         is_coupled = np.abs(self.T) > 0

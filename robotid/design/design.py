@@ -303,7 +303,8 @@ class Designer:
         q, v, a = motion.evaluate(np.linspace(0.0, duration, count + 1))
         rows = self.information.rows(q, v, a)
         used = self.limits.used(q, v, a, 0.0 * a, self.information.torque(rows))
-        contact = self.clearance and self.clearance.nearest(motion, duration)
+        around = self.clearance
+        contact = None if around is None else around.nearest(motion, duration)
         return self._assessed(motion, duration, self.matrix(rows, duration / count), used, contact)
 
     def course(self, design: Design) -> Course:
@@ -324,14 +325,11 @@ class Designer:
         own = information - self.known
         low, *_, high = np.linalg.eigvalsh(own)
         return Design(
-            motion=motion,
-            duration=duration,
-            intervals=used.shape[1] - 1,
+            motion=motion, duration=duration, intervals=used.shape[1] - 1,
             objective=self.judged(information)[0],
             condition=float(np.sqrt(high / low)) if low > 0 else np.inf,
-            used=np.abs(used).max(axis=1),
-            contact=contact,
-        )
+            used=np.abs(used).max(axis=1), contact=contact,
+        )  # fmt: skip
 
     def _clear(self, C: Array) -> tuple[Array, Contact | None]:
         """Return a motion scaled down until it is clear between samples too, and its contact."""
@@ -489,12 +487,9 @@ class Designer:
         for _ in range(_ROUNDS):
             try:
                 found = minimize(
-                    scaled,
-                    (state.iterate / unit).reshape(-1),
-                    jac=True,
-                    method="L-BFGS-B",
+                    scaled, (state.iterate / unit).reshape(-1), jac=True, method="L-BFGS-B",
                     options={"maxiter": _STEPS, "maxcor": 20},
-                )
+                )  # fmt: skip
             except _OutOfTime:
                 return
             state, violation = self._updated(state, found.x.reshape(-1, len(unit)) * unit, settled)

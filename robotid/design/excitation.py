@@ -40,10 +40,9 @@ class MotionSettings(Settings):
     """Kind, criterion and constraints of the motion."""
 
     kind: str = setting(
-        "fourier",
-        "kind of motion: sweeps for friction, stands for gravity; default: fourier",
+        "fourier", "kind of motion: sweeps for friction, stands for gravity; default: fourier",
         among=("fourier", *ROUTES),
-    )
+    )  # fmt: skip
     duration: float = setting(
         10.0, "length [s] of a fourier motion", within=_from(0.1, 3600.0, " s")
     )
@@ -76,10 +75,9 @@ class MotionSettings(Settings):
     boxes: Sequence[Any] = setting((), "obstacle: a box, from its lower to its upper corner [m]")
     noise: Mapping[str, float] = setting({}, "standard deviation of a joint's torque [N m or N]")
     seed: int = setting(
-        0,
-        "seed of the random starts",
+        0, "seed of the random starts",
         within=Range("0 or a positive whole number", lambda x: 0 <= x < 2**63),
-    )
+    )  # fmt: skip
     starts: int = setting(3, "random starts of the optimisation", within=_from(1, 1000))
     seconds: float = setting(
         float("inf"),

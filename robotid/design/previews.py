@@ -301,15 +301,11 @@ def preview(
         SettingsError: If a setting is out of range, or a joint is unknown.
     """
     require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
-    require_kind(
-        estimator, (str, EstimatorSettings), "estimator", "a name or a robotid.EstimatorSettings"
-    )
-    require_kind(
-        noise, (TorqueNoise, Mapping, type(None)), "noise", "a TorqueNoise, or numbers by joint"
-    )
-    require_kind(
-        given, (TorqueIdentification, type(None)), "given", "a robotid.Identification, or none"
-    )
+    none, numbers = type(None), "a TorqueNoise, or numbers by joint"
+    of_estimator = "a name or a robotid.EstimatorSettings"
+    require_kind(estimator, (str, EstimatorSettings), "estimator", of_estimator)
+    require_kind(noise, (TorqueNoise, Mapping, none), "noise", numbers)
+    require_kind(given, (TorqueIdentification, none), "given", "a robotid.Identification, or none")
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
     settings, run = signals or SignalSettings(), None
     model = model if isinstance(model, RobotModel) else RobotModel.from_urdf(model)
@@ -393,7 +389,10 @@ class _Information:
         levels, residuals = [], []
         for log in motions:
             part = compress(base_problem(model, mapping, log.whole.trajectory, log.whole.mask))
-            density = noise.density(_white_step(log))
+            # time between two samples of independent noise, if it is white
+            is_filtered = log.signals.cutoff is not None
+            step = log.step if is_filtered else max(log.step, _row_step(log))
+            density = noise.density(step)
             residual = np.minimum(noise.std**2, density * _band(log))
             no_noise = np.zeros(model.n_rows - len(density))  # in the rows of the base
             levels.append((part, np.append(no_noise, density) / _row_step(log)))
@@ -403,25 +402,19 @@ class _Information:
         if model.constraints:
             mean = np.full(len(mean), np.average(residuals, weights=rows))
         return cls(
-            merge([part for part, _ in levels]),
-            np.sqrt(mean),
-            tuple(levels),
-            None,
+            merge([part for part, _ in levels]), np.sqrt(mean), tuple(levels), None,
             np.sum([log.whole.trajectory.squares for log in motions], axis=0),
             sum(len(log.whole.trajectory.t) for log in motions),
             min(independent_share(log.signals) for log in motions),
-        )
+        )  # fmt: skip
 
     def added_to(self, run: Run) -> "_Information":
         """Return the information of an earlier run and of these motions together."""
         return replace(
-            self,
-            factors=merge([run.factors, self.factors]),
-            run=run,
-            squares=run.squares + self.squares,
-            samples=run.samples + self.samples,
+            self, factors=merge([run.factors, self.factors]), run=run,
+            squares=run.squares + self.squares, samples=run.samples + self.samples,
             share=min(run.share, self.share),
-        )
+        )  # fmt: skip
 
     def without_motions(self) -> "_Information":
         """Return the information of the earlier run only, with the same weights."""
@@ -435,11 +428,6 @@ class _Information:
         for part, level in self.levels:
             meat = meat + part.information(level / sigma**4)
         return meat
-
-
-def _white_step(log: SurveyedLog) -> float:
-    """Return the time between two samples of independent noise, if it is white [s]."""
-    return log.step if log.signals.cutoff is not None else max(log.step, _row_step(log))
 
 
 def _row_step(log: SurveyedLog) -> float:
@@ -538,24 +526,15 @@ def _expected(
     inflation = np.mean([level / information.sigma**2 for _, level in information.levels])
     errors = StandardErrors("noise expected", 0, float(inflation), np.full(len(mapping.K), np.inf))
     return TorqueIdentification(
-        model=model,
-        mapping=mapping,
-        estimator=choice,
-        estimate=estimate,
-        wls=wls,
-        prior=known.pi,
-        urdf_with_drives=pi,
+        model=model, mapping=mapping, estimator=choice, estimate=estimate, wls=wls, prior=known.pi,
         prior_std=known.spread if estimate.prior_std is None else estimate.prior_std,
-        standard=standard,
+        urdf_with_drives=pi, standard=standard,
         standard_covariance=standard_of(estimate, mapping, known.pi, known.spread)[1],
         base=mapping.to_base(standard),
         base_error=_base_error(estimate, mapping, known.pi, known.spread),
-        fitted=fitted,
-        validation=(),
-        errors=errors,
-        factors=information.factors,
+        fitted=fitted, validation=(), errors=errors, factors=information.factors,
         determination=determine(information.factors.names, rows, before),
-    )
+    )  # fmt: skip
 
 
 def _base_error(estimate: Estimate, mapping: BaseMapping, prior: Array, spread: Array) -> Array:

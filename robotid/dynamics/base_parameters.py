@@ -91,10 +91,6 @@ def base_mapping(
     rtol: float = RANK_TOLERANCE,
 ) -> BaseMapping:
     """Return the base parameters of a regressor at random states; scales: physical magnitudes."""
-    if W.ndim != 2 or W.shape[1] != len(names) or len(W) < len(names):
-        raise DataError(f"W has shape {W.shape}, wanted at least {len(names)} rows of {len(names)}")
-    if not np.isfinite(W).all() or not W.any():
-        raise DataError("W is all zero or not finite, wanted finite numbers")
     magnitude = np.ones(len(names)) if scales is None else scales
     R = triangle_of(W) * magnitude  # normalised, a column of rounding errors would count
     order, pivots = _pivot(R)

@@ -253,9 +253,6 @@ def _imu_frame(model: RobotModel, link: str) -> ImuFrame:
 
 def measured_rows(model: RobotModel) -> list[int]:
     """Return the rows of the Jacobian whose forces are measured."""
-    rows, first = [], 0
-    for x in model.constraints:
-        if isinstance(x, Contact):
-            rows += [first + k for k in x.rows_measured]
-        first += x.sizes[x.kind]
-    return rows
+    edges = np.cumsum([0, *(x.sizes[x.kind] for x in model.constraints)]).tolist()
+    pairs = zip(model.constraints, edges, strict=False)
+    return [first + k for x, first in pairs if isinstance(x, Contact) for k in x.rows_measured]

@@ -86,11 +86,6 @@ class Problem:
     sources: tuple[RowSource, ...] = ()  # the same rows joint by joint; empty: only blocks
     is_projected: bool = False  # whether constraint forces were eliminated, as of ``Factors``
 
-    def __post_init__(self) -> None:
-        wanted = (self.n_joints, len(self.names))
-        if self.support.shape != wanted:
-            raise DataError(f"support has shape {self.support.shape}, wanted {wanted}")
-
     def blocks(self) -> Iterator[Block]:
         """Yield the blocks (W (k n, c), tau (k n,), weight (k n,)) from the first one on."""
         return self.stream()
@@ -259,10 +254,7 @@ class Reduction:
 
 
 def compress(problem: Problem, *, threads: int | None = None) -> Factors:
-    """Fold a problem into its factors, in parts of a fixed size, whatever the number of threads.
-
-    See Demmel, Grigori, Hoemmen, Langou (2012), Communication-optimal parallel and sequential QR.
-    """
+    """Fold a problem into factors, in parts of one size (Demmel, Grigori, Hoemmen, Langou 2012)."""
     columns = [np.flatnonzero(row) for row in problem.support]
     triangles = [Triangle(len(own) + 1) for own in columns]
     for source in problem.sources:
@@ -339,8 +331,6 @@ def gather(segments: Sequence[Factors], count: int) -> tuple[Factors, ...]:
 
 def join(reductions: Sequence[Reduction]) -> Reduction:
     """Return the reduction of all rows of several reductions."""
-    if not reductions:
-        raise DataError("there is no reduction, wanted that of at least one log")
     return Reduction(
         merge([r.factors for r in reductions]),
         np.sum([r.squares for r in reductions], axis=0),
@@ -396,25 +386,21 @@ class Triangle:
         self._sizes = self._scratch[:4].view(np.intc)
         self._sizes[[4, 6]] = columns, self._panel
 
-    def fold(self, rows: Array) -> None:
-        """Replace R by the factor of [R; rows], rows (m, c) (Golub, Van Loan 2013, 6.5.3)."""
-        self._fold(rows, 0, 0)
-
     def fold_triangle(self, other: Array, places: Array) -> None:
         """Replace R by the triangular factor of [R; other], with places of its columns."""
         if len(places) == len(self.R):
             if self._is_empty:
                 self.R[:], self._is_empty = other, False
             else:
-                self._fold(other.copy(order="F"), 0, len(other))
+                self.fold(other.copy(order="F"), 0, len(other))
             return
         first = int(places[0])
         rows = np.zeros((len(places), len(self.R) - first), order="F")
         rows[:, places - first] = other
-        self._fold(rows, first, len(rows))
+        self.fold(rows, first, len(rows))
 
-    def _fold(self, rows: Array, first: int, triangular: int) -> None:
-        """Fold rows from a column on; the last ones of them are upper trapezoidal."""
+    def fold(self, rows: Array, first: int = 0, triangular: int = 0) -> None:
+        """Replace R by the factor of [R; rows] from a column on (Golub, Van Loan 2013, 6.5.3)."""
         if len(rows) == 0:
             return
         self._is_empty = False

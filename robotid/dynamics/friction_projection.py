@@ -149,10 +149,7 @@ def _own_terms(model: RobotModel, d: int) -> list[tuple[int, DriveTerm]]:
 def project_friction(
     model: RobotModel, pi: Array, moments: Mapping[str, DriveMoments], onto: Collection[str]
 ) -> Projection:
-    """Return a robot whose drives have only the terms of a format, by least squares.
-
-    Inertia, and offsets in a format without them, are unchanged; other terms are not negative.
-    """
+    """Return a robot whose drives have only the terms of a format and inertia, by least squares."""
     layout, projected = model.layout, []
     for d, drive in enumerate(layout.drives):
         simple = (*_SIMPLE, Lag.label)  # a delay is not friction: it is omitted and named

@@ -217,9 +217,8 @@ def _forces(
     starts = [first for x, first in pairs if isinstance(x, Contact) and x.frame in names]
     if motion.wrenches is not None:
         b -= np.einsum("kmj,km->kj", J[:, known], motion.wrenches)
-    velocity = np.stack(
-        [np.einsum("kij,kj->ki", J[:, i : i + 3], motion.v) for i in starts], axis=1
-    )
+    speeds = np.einsum("kij,kj->ki", J, motion.v)
+    velocity = np.stack([speeds[:, i : i + 3] for i in starts], axis=1)
     J[:, known] = 0.0
     size = np.sqrt(np.mean(torque[:, :3] ** 2)) + 1e-9  # of any force, so that f is determined
     sigma = _noise_of_groups(J, b, size)
@@ -234,10 +233,9 @@ def _forces(
 
 
 def _noise_of_groups(J: Array, b: Array, size: float) -> Array:
-    """Return the noise level of rows, shape (n_rows,): one for forces, moments and joints each.
+    """Return the noise level of rows (n_rows,), of three groups, by restricted maximum likelihood.
 
-    Restricted maximum likelihood by Fisher scoring: Searle, Casella, McCulloch (1992), Variance
-    Components, 8.3. Reweighting by residuals over leverages needs tens of rounds.
+    See Searle, Casella, McCulloch (1992), Variance Components, 8.3 (Fisher scoring).
     """
     step, n = max(1, len(b) // _SAMPLES), b.shape[1]
     J, b, weak = J[::step], b[::step], np.eye(J.shape[1]) / (_WIDER * size) ** 2
@@ -315,11 +313,7 @@ def row_mask(model: RobotModel, trajectory: Trajectory, min_velocity: float) -> 
 
 
 def static_rows(model: RobotModel, log: Log, signals: SignalSettings) -> tuple[Trajectory, Array]:
-    """Return the samples of a log for a static model: rest phases and slow segments, one each.
-
-    At rest friction is anywhere within its limits: rest phases are used without it, and only for
-    joints that move in fewer samples than there are rest phases.
-    """
+    """Return the samples of a log for a static model: rest phases and slow segments, one each."""
     layout, n = model.layout, len(model.joints)
     unit, least = layout.drive_speeds[:n], min(signals.min_velocity, _MOVES)
     # inertial over gravity torque of a link of length l: a l / g and v^2 l / g
@@ -329,6 +323,7 @@ def static_rows(model: RobotModel, log: Log, signals: SignalSettings) -> tuple[T
         log, signals.max_gap or np.inf, least * unit, np.sqrt(largest) * size, largest * size
     )
     moves = sure_rows(layout, motion.v, least)
+    # at rest, friction is anywhere within its limits: it is left out, and part of the residual
     used = moves | (at_rest[:, None] & (moves.sum(axis=0) <= at_rest.sum()))
     signs, still = friction_directions(layout, motion.v, None), np.zeros_like(motion.v)
     return replace(motion, v=still, direction=signs if signs.shape[1] else None), used

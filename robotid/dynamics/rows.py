@@ -35,9 +35,8 @@ _MOST_BYTES = 2**25  # of inertial columns that are stored with a trajectory
 
 _log = logging.getLogger(__name__)
 
-#: Work, samples times ``work_per_sample``, from which the compiled path is faster despite its start
-#: of about 0.5 s per process (importing Numba, reading the compiled code). For seven joints in
-#: series that is 1e5 samples. Compiling it takes some 10 s, once per installation.
+#: Samples times ``work_per_sample`` from which the compiled path is faster despite its start of
+#: 0.5 s per process: 1e5 samples of seven joints. Compiling takes 10 s, once per installation.
 LONG_ENOUGH = 3_500_000
 
 
@@ -59,11 +58,6 @@ def why_not(model: RobotModel) -> str | None:
     except ImportError as error:
         return f"Numba cannot be imported: {error}"
     return None
-
-
-def keeps_code() -> bool:
-    """Return whether there is a cache folder for compiled code."""
-    return tree_lanes().inertial_rows.stats.cache_path is not None
 
 
 class Tree(NamedTuple):
@@ -180,7 +174,7 @@ def choose_engine(model: RobotModel, samples: int, compiled: bool | None) -> str
         engine += f" (the compiled path is slower below {enough} samples)"
     elif compiled is not False:
         reason = why_not(model)
-        if reason is None and compiled is None and not keeps_code():
+        if reason is None and not compiled and not tree_lanes().inertial_rows.stats.cache_path:
             reason = "no folder for compiled code; set one as NUMBA_CACHE_DIR"
         engine = COMPILED if reason is None else f"{engine} ({reason})"
     _log.info("%s: regressor of %d samples: %s", model.name, samples, engine)
@@ -501,9 +495,8 @@ class _PinocchioWriter:
         out[plan.drive_places] = plan.ratios * self._values[plan.drive_numbers, part]
         out[plan.torques] = m.tau[own].T
         if self._weights is not None:
-            for root, (i, j) in zip(
-                np.sqrt(self._weights[part]).T, pairwise(self._plan.first), strict=True
-            ):
+            roots = np.sqrt(self._weights[part]).T
+            for root, (i, j) in zip(roots, pairwise(plan.first), strict=True):
                 out[i:j] *= root
 
     def write_inertial(self, q: Array, v: Array, a: Array) -> None:
@@ -512,10 +505,8 @@ class _PinocchioWriter:
         wanted = self._wanted
         if self._map is not None:
             v, a = v @ self._map.T, a @ self._map.T
-        instants = zip(
-            self._raw, np.ascontiguousarray(self._model.configurations(q)), v, a, strict=False
-        )
-        for raw_k, q_k, v_k, a_k in instants:
+        x = np.ascontiguousarray(self._model.configurations(q))
+        for raw_k, q_k, v_k, a_k in zip(self._raw, x, v, a, strict=False):
             # only the wanted entries, while the regressor is in the cache; without bound checks
             regressor(model, data, q_k, v_k, a_k).take(wanted, None, raw_k, "clip")
         out, raw = self._out[:, : len(q)], self._raw[: len(q)].T

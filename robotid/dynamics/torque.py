@@ -6,7 +6,7 @@ inverse dynamics: three prismatic joints at position 0 before each joint displac
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -39,6 +39,8 @@ from robotid.robot.drive_term import DriveMotion
 from robotid.robot.drives import TERMS, Lag
 from robotid.robot.model import RobotModel
 
+State: TypeAlias = tuple[Array, Array, Array]  # q, v, a
+
 _DECADES = 3.0  # of speeds, at random states of a robot with nonlinear friction
 _START = 5  # constant work of one call of inverse dynamics, as of work_per_sample
 
@@ -53,9 +55,8 @@ def joint_torque_regressor(
 ) -> Array:
     """Return the regressor Y with tau = Y pi at each of N samples, shape (N n_rows, p).
 
-    Ten inertial columns of each body (Atkeson, An, Hollerbach 1986), then those of the drives:
-    ``tau_j = Ia a_j + Fv v_j + Fc sign(v_j) + off``. v and a (N, n_rows); None: directions (N, c)
-    are the signs of the speeds, internal states (N, m) steady ones.
+    Ten columns of each body (Atkeson, An, Hollerbach 1986), then those of the drives. None:
+    directions (N, c) are the signs of the speeds, internal states (N, m) steady ones.
     """
     wanted = (len(q), model.n_rows)
     if v.shape != wanted or a.shape != wanted:
@@ -67,7 +68,7 @@ def joint_torque_regressor(
             raise DataError(f"{name}[{k}] of {row} is {values[k, j]}, wanted a finite number")
     Y = np.zeros((len(q), model.n_rows, len(model.layout.names)))
     inertial_rows(model, q, v, a).write(slice(None), Y)
-    _write_drives(model, q, v, a, direction, memory, Y)
+    _write_drives(model, (q, v, a), direction, memory, Y)
     return Y.reshape(len(q) * model.n_rows, -1)
 
 
@@ -80,7 +81,7 @@ def trajectory_regressor(
         return joint_torque_regressor(model, m.q, m.v, m.a, m.direction, m.memory)
     Y = np.zeros((len(m.t), model.n_rows, len(model.layout.names)))
     stored.write(slice(None) if samples is None else samples, Y)
-    _write_drives(model, m.q, m.v, m.a, m.direction, m.memory, Y)
+    _write_drives(model, (m.q, m.v, m.a), m.direction, m.memory, Y)
     return Y.reshape(len(m.t) * model.n_rows, -1)
 
 
@@ -121,7 +122,7 @@ class InstantRegressor:
             for term, place in self._terms:
                 Y[rows, place] = term.column(motion)
             return Y[:, self._columns]
-        _write_drives(model, q[None], v[None], a[None], None, None, Y[None])
+        _write_drives(model, (q[None], v[None], a[None]), None, None, Y[None])
         return Y[:, self._columns]
 
 
@@ -163,13 +164,9 @@ def build_problem(
 
 
 def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) -> Array:
-    """Return the regressor at random states, shape (N n_rows, p), for structural properties.
-
-    With speeds sqrt(g / length) and accelerations g / length, gravity over inertia is the same for
-    a finger and a crane. Loops are closed, and their forces eliminated.
-    """
+    """Return the regressor at random states, (N n_rows, p); loops closed, without their forces."""
     n = len(model.joints)
-    rate = np.sqrt(9.81 / model.length)  # [1/s]
+    rate = np.sqrt(9.81 / model.length)  # [1/s]: gravity counts the same for finger and crane
     size = np.array([model.length if j.type == "prismatic" else np.pi for j in model.limits])
     q = rng.uniform(-1, 1, (samples, n)) * size
     unit = np.minimum(size, 1.0)  # [rad or m]
@@ -203,21 +200,15 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
 
 
 def _write_drives(
-    model: RobotModel,
-    q: Array,
-    v: Array,
-    a: Array,
-    direction: Array | None,
-    memory: Array | None,
-    Y: Array,
+    model: RobotModel, state: State, direction: Array | None, memory: Array | None, Y: Array
 ) -> None:
     """Write the drives' columns beside those of the bodies, (N, n_rows, p); no memory: steady."""
     layout, size, first = model.layout, model.layout.n_inertial, model.n_rows - len(model.joints)
-    signs = friction_directions(layout, v, direction)
+    signs = friction_directions(layout, state[1], direction)
     if memory is None and layout.remembering:
         load = Y[:, first:, :size] @ model.carried_by[:size]
-        memory = remembered(layout, drive_motion(layout, q, v, a, signs, load))
-    values = drive_values(layout, q, v, a, signs, memory)
+        memory = remembered(layout, drive_motion(layout, *state, signs, load))
+    values = drive_values(layout, *state, signs, memory)
     np.multiply(layout.drive_loads, values.T[:, None], out=Y[:, first:, size:])
 
 
@@ -238,16 +229,14 @@ def predict(
     *,
     compiled: bool | None = None,
 ) -> list[Array]:
-    """Return the torque W theta, (N, n_rows) [N m, N], of several vectors; constrained: P W theta.
-
-    By rows for all together, or, not compiled and few, by inverse dynamics for each (Luh 1980).
-    """
+    """Return the torque W theta, (N, n_rows) [N m, N], of each vector; constrained: P W theta."""
     source = trajectory_rows(model, trajectory, None, compiled)
     stacked = np.column_stack(list(parameters))
     few = len(parameters) * (_START + model.pin_model.nv) <= work_per_sample(model)
     if source.inertial is not None:
         torques = _from_kept(source, source.inertial, stacked)
     elif source.engine != COMPILED and few and all(_has_centres(model, pi) for pi in parameters):
+        # Luh, Walker, Paul (1980)
         torques = [inverse_dynamics(model, pi, trajectory) for pi in parameters]
     else:
         torques = _from_rows(source, stacked)
@@ -350,9 +339,7 @@ def inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> Ar
 
 def _bodies_torque(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> Array:
     """Return the torque of bodies, of inconsistent ones as a difference, shape (N, n_rows)."""
-    added = _consistent_addition(model, pi)
-    torque = _newton_euler(model, pi + added, q, v, a)
-    return torque - _newton_euler(model, added, q, v, a) if added.any() else torque
+    return _of_consistent(_newton_euler, model, pi, q, v, a)[0]
 
 
 def drive_torque(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
@@ -363,24 +350,24 @@ def drive_torque(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
 
 def body_slopes(model: RobotModel, pi: Array, trajectory: Trajectory) -> TorqueSlopes:
     """Return the derivatives of the bodies' torque by motion, gravity and origins of joints."""
-    return TorqueSlopes(*_of_consistent(_torque_slopes, model, pi, trajectory))
+    state = trajectory.q, trajectory.v, trajectory.a
+    return TorqueSlopes(*_of_consistent(_torque_slopes, model, pi, *state))
 
 
 def body_slopes_by_position(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
     """Return ``body_slopes`` by the positions alone, (N, n, n), several times as fast."""
-    return _of_consistent(_position_slopes, model, pi, trajectory)[0]
+    return _of_consistent(_position_slopes, model, pi, trajectory.q, trajectory.v, trajectory.a)[0]
 
 
 def _of_consistent(
-    slopes: Callable[..., Sequence[Array]], model: RobotModel, pi: Array, trajectory: Trajectory
+    linear: Callable[..., Sequence[Array]], model: RobotModel, pi: Array, *state: Array
 ) -> Sequence[Array]:
-    """Return derivatives for consistent bodies, or the difference of those of two sets of these."""
+    """Return values that are linear in the bodies, or their difference for two consistent sets."""
     added = _consistent_addition(model, pi)
-    state = trajectory.q, trajectory.v, trajectory.a
-    total = slopes(model, pi + added, *state)
+    total = linear(model, pi + added, *state)
     if not added.any():
         return total
-    return [x - y for x, y in zip(total, slopes(model, added, *state), strict=True)]
+    return [x - y for x, y in zip(total, linear(model, added, *state), strict=True)]
 
 
 def _consistent_addition(model: RobotModel, pi: Array) -> Array:
@@ -396,8 +383,8 @@ def _consistent_addition(model: RobotModel, pi: Array) -> Array:
     return added
 
 
-def _newton_euler(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> Array:
-    """Return the torque of the bodies, shape (N, n_rows)."""
+def _newton_euler(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> tuple[Array]:
+    """Return the torque of consistent bodies, shape (N, n_rows)."""
     G, pin_model = model.velocity_map, model.with_parameters(pi).pin_model
     data, torque = pin_model.createData(), np.empty((len(v), pin_model.nv))
     is_plain = np.array_equal(G, np.eye(len(G)))
@@ -410,7 +397,7 @@ def _newton_euler(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) ->
     else:
         for torque_k, q_k in zip(torque, configurations, strict=True):
             torque_k[:] = pin.computeGeneralizedGravity(pin_model, data, q_k)
-    return torque if is_plain else torque @ G  # tau = G^T tau_pinocchio
+    return (torque if is_plain else torque @ G,)  # tau = G^T tau_pinocchio
 
 
 def _position_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> tuple[Array]:

@@ -197,15 +197,9 @@ class Innovations:
         return bool((self.ratio < _CONVERGED).all())
 
     def push(
-        self,
-        t: float,
-        tau: Array,
-        e: Array,
-        residual: Array,
-        uncertainty: Array,
-        used: Array,
+        self, t: float, tau: Array, e: Array, residual: Array, uncertainty: Array, used: Array,
         share: float,
-    ) -> float | None:
+    ) -> float | None:  # fmt: skip
         """Process one sample; return the onset of a change flagged now [s], else None."""
         # tau, innovation e and residual (n,) [N m or N], uncertainty (n,) their squares, used (n,)
         expected = uncertainty + self.variance + self._model_error**2 * self._torque
@@ -266,24 +260,20 @@ class OnlineSettings(Settings):
     cutoff: float = setting(8.0, "cut-off of the causal filter [Hz]", within=POSITIVE)
     min_velocity: float = setting(0.02, "as of ``SignalSettings`` [rad/s]", within=NOT_NEGATIVE)
     warmup: float = setting(
-        1.0,
-        "time of motion before the first estimate, which scales the drive terms [s]",
+        1.0, "time of motion before the first estimate, which scales the drive terms [s]",
         within=POSITIVE,
-    )
+    )  # fmt: skip
     walk: float = setting(
-        1e-4,
-        "random walk of the parameters, relative to their prior spread, per square root of a "
-        "second [s^-1/2]",
-        within=NOT_NEGATIVE,
-    )
+        1e-4, "random walk of the parameters, relative to their prior spread, per square root of a "
+        "second [s^-1/2]", within=NOT_NEGATIVE,
+    )  # fmt: skip
     threshold: float = setting(
         40.0, "evidence at which a change is flagged; see ``ChangeDetector``", within=POSITIVE
     )
     model_error: float = setting(
-        0.05,
-        "error of the model without a change, relative to each joint's torque [-]",
+        0.05, "error of the model without a change, relative to each joint's torque [-]",
         within=NOT_NEGATIVE,
-    )
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -415,14 +405,10 @@ class OnlineIdentifier:
         self._require_ready()
         variance = np.maximum(np.diag(self._state.P), 0.0)
         left = np.minimum(variance / self._prior_variance, 1.0)
-        return Reading(
-            t=self._t,
-            theta=self._state.theta,
-            std_error=np.sqrt(variance),
-            sigma=np.sqrt(self._innovations.variance),
-            excitation=float(1.0 - left.mean()),
-            converged=self._innovations.is_converged,
-        )
+        sigma, is_converged = np.sqrt(self._innovations.variance), self._innovations.is_converged
+        excitation = float(1.0 - left.mean())
+        theta = self._state.theta
+        return Reading(self._t, theta, np.sqrt(variance), sigma, excitation, is_converged)
 
     @property
     def estimate(self) -> Estimate:
@@ -444,12 +430,8 @@ class OnlineIdentifier:
         if not -len(self.changes) <= index < len(self.changes):
             raise DataError(f"there is no change {index}: {len(self.changes)} were flagged")
         change = self.changes[index]
-        return payload_of(
-            self._state.theta - change.theta,
-            self._state.P + change.covariance,
-            self._load_columns,
-            self._load_spread,
-        )
+        difference, C = self._state.theta - change.theta, self._state.P + change.covariance
+        return payload_of(difference, C, self._load_columns, self._load_spread)
 
     def _require_ready(self) -> Kalman:
         if self._kalman is None:

@@ -246,11 +246,8 @@ def identify_payload(
         NotConvergedError: If a solver fails.
     """
     require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
-    for name, value, wanted in (
-        ("links", links, "names of links"),
-        ("unknown_gains", unknown_gains, "names of joints"),
-    ):
-        require_each(value, str, name, wanted)
+    require_each(links, str, "links", "names of links")
+    require_each(unknown_gains, str, "unknown_gains", "names of joints")
     require_kind(masses, (Mapping, type(None)), "masses", "a table of masses [kg] by link")
     model = robot_of(model, logs)
     settings = signals or SignalSettings()
@@ -495,13 +492,9 @@ def _possible(
     ball = mass * [1.0, 0.0, 0.0, 0.0, r**2, 0.0, r**2, 0.0, 0.0, r**2]
     stated = {link: (masses[link], masses[link]) for link in links if link in masses}
     fit = Consistent(
-        layout=ParameterLayout(tuple(links), (), ()),
-        K=np.eye(len(x)),
-        prior=ball.reshape(-1),
-        prior_std=scale,
-        prior_weight=_NONE,
-        constraints=Constraints(mass=stated),
-    )
+        layout=ParameterLayout(tuple(links), (), ()), K=np.eye(len(x)), prior=ball.reshape(-1),
+        prior_std=scale, prior_weight=_NONE, constraints=Constraints(mass=stated),
+    )  # fmt: skip
     # a stated mass has no covariance; its constraint fixes it. Data without noise have almost none
     exact = np.diag(np.where(np.diag(C) == 0, scale, _NONE * scale) ** 2)
     names, rank = fit.layout.names, len(x)

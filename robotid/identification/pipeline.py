@@ -59,8 +59,10 @@ def in_memory(
     model: RobotModel, settings: SignalSettings, fitted: Sequence[Log], held_out: Sequence[Log] = ()
 ) -> Recordings:
     """Return the recordings of logs in memory."""
-    runs = [[hold_log(model, log, settings) for log in some] for some in (fitted, held_out)]
-    return Recordings(model, structural_mapping(model), *runs)
+    first, second = (
+        [hold_log(model, log, settings) for log in some] for some in (fitted, held_out)
+    )
+    return Recordings(model, structural_mapping(model), first, second)
 
 
 def logs_of(

@@ -182,33 +182,24 @@ class TorqueIdentification(Identification, Fit):
         """Verdict on the result, with reasons."""
         model, recordings = self.model, [e.recording for e in (*self.fitted, *self.validation)]
         driven = tuple(x for x in model.joints if x not in model.passive)
+        has_torque = any(recording.log.has_torque for recording in recordings)
         predictions = Predictions(
-            self.metrics(),
-            self.predictions,
-            driven if any(recording.log.has_torque for recording in recordings) else (),
-            refitted=[e.name for e in self.refitted],
-            hidden=hidden_joints(model, self.fitted),
-        )
+            self.metrics(), self.predictions, driven if has_torque else (),
+            refitted=[e.name for e in self.refitted], hidden=hidden_joints(model, self.fitted),
+        )  # fmt: skip
         sources = list(zip(model.layout.names, self.sources, strict=True))
         by_prior = [name for name, x in sources[model.layout.n_inertial :] if x == "prior"]
         determined = Determined(
-            self.determination.undetermined,
-            self.is_consistent,
-            self.is_poorly_excited,
-            model.is_static,
-            [name for name in by_prior if name not in self.undetermined],
-        )
+            self.determination.undetermined, self.is_consistent, self.is_poorly_excited,
+            model.is_static, [name for name in by_prior if name not in self.undetermined],
+        )  # fmt: skip
         # not of long logs, of which only parts are in memory, and not of projected rows, whose
         # torques are not those of joints
         has_cause = not (model.constraints or any(x.is_partial for x in recordings))
         return judge(
-            predictions,
-            determined,
-            log_errors=self.log_errors,
-            warnings=self.warnings,
-            scale_check=self.scale_check,
-            cause_of=self._cause_of if has_cause else None,
-        )
+            predictions, determined, log_errors=self.log_errors, warnings=self.warnings,
+            scale_check=self.scale_check, cause_of=self._cause_of if has_cause else None,
+        )  # fmt: skip
 
     def _cause_of(self, joint: str) -> tuple[str, str]:
         """Return the cause of a joint's residual, and what to do."""

@@ -123,11 +123,6 @@ class ParameterLayout:
         """Number of inertial parameters, 10 per body."""
         return 10 * len(self.bodies)
 
-    @property
-    def coupling_terms(self) -> tuple[str, ...]:
-        """Drive terms of a coupling that replaces no joint's drive: those without the offset."""
-        return tuple(term for term in self.terms if TERMS[term].is_shared)
-
     @cached_property
     def drives(self) -> tuple[Coupling, ...]:
         """The drives: one per joint (or the coupling that replaces it), then other couplings."""
@@ -160,7 +155,7 @@ class ParameterLayout:
         """Index in ``drives`` of each drive parameter, and its term."""
         beside = len(self.drives) - len(self.joints)
         shared = [() if joint in self.passive else self.terms for joint in self.joints]
-        shared += [self.coupling_terms] * beside
+        shared += [tuple(term for term in self.terms if TERMS[term].is_shared)] * beside
         return tuple(
             (d, term)
             for d, (drive, names) in enumerate(zip(self.drives, shared, strict=True))
@@ -189,19 +184,15 @@ class ParameterLayout:
         return np.asarray(self.drive_ratios[[d for d, _ in self.drive_parameters]].T)
 
     @cached_property
-    def inertial_names(self) -> tuple[str, ...]:
-        """Names of the inertial parameters, for example ``"forearm.mcx"``."""
-        return tuple(f"{body}.{term}" for body in self.bodies for term in INERTIAL_TERMS)
-
-    @cached_property
     def drive_names(self) -> tuple[str, ...]:
         """Names of the drive parameters, for example ``"elbow.viscous"``."""
         return tuple(f"{self.drives[d].name}.{term.name}" for d, term in self.drive_parameters)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of all p parameters."""
-        return self.inertial_names + self.drive_names
+        """Names of all p parameters, for example ``"forearm.mcx"``, ``"elbow.viscous"``."""
+        inertial = tuple(f"{body}.{term}" for body in self.bodies for term in INERTIAL_TERMS)
+        return inertial + self.drive_names
 
     @cached_property
     def units(self) -> tuple[str, ...]:

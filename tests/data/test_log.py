@@ -7,6 +7,7 @@ from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
+from helpers.synthetic import sine_log
 
 from robotid.base.exceptions import DataError
 from robotid.data import log as log_module
@@ -26,12 +27,8 @@ PHASE = T[:, None] * [2.0, 3.0]
 
 
 def make_log(**changes):
-    fields = {
-        "t": T, "q": np.sin(PHASE), "v": np.cos(PHASE) * [2.0, 3.0],
-        "a": -np.sin(PHASE) * [4.0, 9.0], "tau": 10 * np.cos(PHASE), "joints": JOINTS,
-        "path": "somewhere/run3.csv",
-    }  # fmt: skip
-    return Log(**(fields | changes))
+    a = -np.sin(PHASE) * [4.0, 9.0]
+    return sine_log(500, 100, **({"a": a, "path": "somewhere/run3.csv"} | changes))
 
 
 def make_trajectory(**changes):

@@ -5,27 +5,36 @@ from robotid.design.clearance import _FIRST, Box, Clearance
 from robotid.dynamics.simulation.motions import ProgramMotion, random_fourier
 from robotid.robot.model import RobotModel
 
-# a slider that carries a ball past a post: distances are known by hand
-SLIDER = """
-<robot name="slider">
-  <link name="base"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
-  <link name="car"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
-    iyz="0"/></inertial></link>
-  <link name="ball"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
-    iyz="0"/></inertial>
-    <collision><origin xyz="0 0.5 0"/><geometry><box size="0.1 0.1 0.1"/></geometry></collision>
-  </link>
-  <joint name="slide" type="prismatic"><parent link="base"/><child link="car"/>
-    <axis xyz="1 0 0"/><limit lower="-1" upper="1" velocity="2" effort="100"/></joint>
-  <joint name="turn" type="revolute"><parent link="car"/><child link="ball"/>
-    <axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="2" effort="100"/></joint>
-</robot>"""
+MASS = """<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>
+</inertial>"""
+
+
+def robot(folder, links, joints):
+    """Return a robot of links (name, size of a box or "", its place) and joints in a chain."""
+    words = []
+    for name, size, place in links:
+        box = f'<origin xyz="{place}"/><geometry><box size="{size}"/></geometry>'
+        box = f"<collision>{box}</collision>" if size else ""
+        words.append(f'<link name="{name}">{MASS if words else ""}{box}</link>')
+    for (parent, *_), (child, *_), (kind, axis, reach, height) in zip(
+        links[:-1], links[1:], joints, strict=True
+    ):
+        words.append(
+            f'<joint name="{child}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+            f'<origin xyz="0 0 {height}"/><axis xyz="{axis}"/>'
+            f'<limit lower="-{reach}" upper="{reach}" velocity="2" effort="100"/></joint>'
+        )
+    (folder / "robot.urdf").write_text(f'<robot name="robot">{"".join(words)}</robot>')
+    return RobotModel.from_urdf(folder / "robot.urdf")
 
 
 @pytest.fixture
 def slider(tmp_path):
-    (tmp_path / "slider.urdf").write_text(SLIDER)
-    return RobotModel.from_urdf(tmp_path / "slider.urdf")
+    """A slider that carries a ball past a post: distances are known by hand."""
+    cube = "0.1 0.1 0.1"
+    links = [("base", cube, "0 0 0"), ("car", "", ""), ("ball", cube, "0 0.5 0")]
+    joints = [("prismatic", "1 0 0", 1, 0), ("revolute", "0 0 1", 3, 0)]
+    return robot(tmp_path, links, joints)
 
 
 def distances(clearance, q):
@@ -103,33 +112,16 @@ def test_the_nearest_place_is_a_lower_bound_within_a_millimetre(panda, seed):
     assert margins[pair] < margins.min() + 1e-4  # it is that pair, not one that has a lower bound
 
 
-# a plate that tilts 15 mm above the base: nearer than the clearance in every pose, and its edge
-# hits the base if it tilts far; a pin of the plate goes through the base
-TILTED = """
-<robot name="tilted">
-  <link name="base"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
-  <link name="axle"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
-    iyz="0"/></inertial></link>
-  <link name="plate"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
-    iyz="0"/></inertial>
-    <collision><origin xyz="0 0 0.01"/><geometry><box size="0.1 0.1 0.02"/></geometry></collision>
-  </link>
-  <link name="pin"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
-    iyz="0"/></inertial>
-    <collision><geometry><box size="0.02 0.02 0.2"/></geometry></collision></link>
-  <joint name="turn" type="revolute"><parent link="base"/><child link="axle"/>
-    <axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="2" effort="100"/></joint>
-  <joint name="tilt" type="revolute"><parent link="axle"/><child link="plate"/>
-    <origin xyz="0 0 0.065"/>
-    <axis xyz="1 0 0"/><limit lower="-0.35" upper="0.35" velocity="2" effort="100"/></joint>
-  <joint name="spin" type="revolute"><parent link="plate"/><child link="pin"/>
-    <axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="2" effort="100"/></joint>
-</robot>"""
-
-
 def test_links_that_are_built_near_each_other_are_watched_and_those_that_touch_are_named(tmp_path):
-    (tmp_path / "tilted.urdf").write_text(TILTED)
-    clearance = Clearance(RobotModel.from_urdf(tmp_path / "tilted.urdf"), least=0.02)
+    # a plate that tilts 15 mm above the base: nearer than the clearance in every pose, and its edge
+    # hits the base if it tilts far; a pin of the plate goes through the base
+    links = [
+        ("base", "0.1 0.1 0.1", "0 0 0"), ("axle", "", ""), ("plate", "0.1 0.1 0.02", "0 0 0.01"),
+        ("pin", "0.02 0.02 0.2", "0 0 0"),
+    ]  # fmt: skip
+    joints = [("revolute", "0 0 1", 1, 0), ("revolute", "1 0 0", 0.35, 0.065),
+              ("revolute", "0 0 1", 1, 0)]  # fmt: skip
+    clearance = Clearance(robot(tmp_path, links, joints), least=0.02)
     # the pin's end is 35 + 50 mm deep in the base, 30 + 30 mm from its sides
     (touching,) = clearance.made_to
     assert touching.startswith("base and pin (overlap by ")

@@ -57,10 +57,7 @@ def test_the_pose_of_the_root_follows_from_that_of_a_moving_link(robot, link, ha
     assert found.link == ""
     signs = np.sign(np.sum(found.pose[:, 3:] * roots[:, 3:], axis=1))
     np.testing.assert_allclose(found.pose[:, 3:], signs[:, None] * roots[:, 3:], atol=1e-12)
-    if link == "base_link":  # the root itself
-        assert found.twist is not None
-    else:
-        assert found.twist is None
+    assert (found.twist is not None) == (link == "base_link")  # the root itself
     assert found.has_position == has_position
     if has_position:
         np.testing.assert_allclose(found.pose[:, :3], roots[:, :3], atol=1e-12)

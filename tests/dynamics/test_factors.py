@@ -100,21 +100,21 @@ def test_stretches_need_rows_that_can_be_cut(rng):
         compress_segments(make(rng)[0], 10)
 
 
+#: Supports of trees: each joint has the columns of all that it carries.
+TREES = {
+    "chain": [[1, 1, 1, 1, 1], [0, 1, 1, 1, 1], [0, 0, 0, 1, 1]],
+    "two fingers on a palm": [[1, 1, 1, 1, 1], [0, 1, 1, 0, 0], [0, 0, 0, 1, 1]],
+    "apart": [[1, 1, 0, 0, 0], [0, 0, 1, 0, 1], [0, 0, 0, 1, 0]],
+    "overlapping": [[1, 1, 1, 0, 0], [0, 0, 1, 1, 1], [0, 0, 0, 0, 0]],
+    "alike": [[1, 0, 1, 1, 1]] * 3,
+}
+
+
 def tree_support(kind):
-    """Support of a tree: each joint has the columns of all that it carries."""
-    tree = {
-        "chain": [[1, 1, 1, 1, 1], [0, 1, 1, 1, 1], [0, 0, 0, 1, 1]],
-        "two fingers on a palm": [[1, 1, 1, 1, 1], [0, 1, 1, 0, 0], [0, 0, 0, 1, 1]],
-        "apart": [[1, 1, 0, 0, 0], [0, 0, 1, 0, 1], [0, 0, 0, 1, 0]],
-        "overlapping": [[1, 1, 1, 0, 0], [0, 0, 1, 1, 1], [0, 0, 0, 0, 0]],
-        "alike": [[1, 0, 1, 1, 1]] * 3,
-    }
-    return np.array(tree[kind], dtype=bool)
+    return np.array(TREES[kind], dtype=bool)
 
 
-@pytest.mark.parametrize(
-    "kind", ["chain", "two fingers on a palm", "apart", "overlapping", "alike"]
-)
+@pytest.mark.parametrize("kind", TREES)
 def test_compact_factors_are_those_of_the_dense_rows(rng, kind):
     problem, W, tau = make(rng, support=tree_support(kind))
     factors, A = compress(problem), np.column_stack([W, tau])
@@ -210,13 +210,8 @@ def test_pieces_are_joined_to_stretches_of_one_length(rng, count, most, lengths)
 
 def test_stretches_are_gathered_to_as_many_as_wanted_or_as_there_are(rng):
     pieces = [compress(make(rng, samples=10 + k)[0]) for k in range(5)]
-    for count, edges in (
-        (2, [0, 2, 5]),
-        (3, [0, 2, 3, 5]),
-        (5, range(6)),
-        (9, range(6)),
-        (1, [0, 5]),
-    ):
+    every = range(6)
+    for count, edges in ((2, [0, 2, 5]), (3, [0, 2, 3, 5]), (5, every), (9, every), (1, [0, 5])):
         found = gather(pieces, count)
         assert len(found) == len(edges) - 1
         for own, i, j in zip(found, edges[:-1], edges[1:], strict=True):

@@ -8,17 +8,9 @@ import scipy.optimize
 from helpers.robots import motion
 
 from robotid.base.exceptions import DataError
-from robotid.data.log import Trajectory
 from robotid.dynamics.friction_projection import DriveMoments, drive_moments, project_friction
 from robotid.dynamics.torque import remember, trajectory_regressor
-from robotid.robot.drives import (
-    Asymmetric,
-    Harmonic,
-    Lag,
-    LoadFriction,
-    Presliding,
-    Stribeck,
-)
+from robotid.robot.drives import Asymmetric, Harmonic, Lag, LoadFriction, Presliding, Stribeck
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
@@ -47,17 +39,11 @@ def case(ur5):
     model, rng = model.with_reference(pi), np.random.default_rng(4)
     recordings = []
     for count in (300, 120):
-        m = motion(model, rng, count)
-        plain = Trajectory(
-            np.arange(count) / 100.0, m.q, m.v, m.a, np.zeros_like(m.q), m.joints, None,
-            np.zeros(count, dtype=int),
-        )  # fmt: skip
-        m = remember(model, plain)
+        m = remember(model, motion(model, rng, count))
         tau = (trajectory_regressor(model, m) @ pi).reshape(m.q.shape)
         mask = np.abs(m.v) > 0.3
         mask[: count // 3, 1] = False
-        recordings.append((Trajectory(m.t, m.q, m.v, m.a, tau, m.joints, None, m.segment,
-                                      m.direction, m.memory), mask))  # fmt: skip
+        recordings.append((replace(m, tau=tau), mask))
     return model, pi, recordings
 
 

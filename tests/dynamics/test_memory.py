@@ -6,7 +6,7 @@ import pytest
 from helpers.robots import motion
 
 from robotid.data.log import Trajectory
-from robotid.dynamics.torque import drive_motion_along, is_loaded, remember, rigid_parts
+from robotid.dynamics.torque import drive_motion_along, is_loaded, remember
 from robotid.robot.drives import Lag, LoadFriction, Presliding
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -48,30 +48,6 @@ def test_drives_are_loaded_by_the_bodies_and_their_stretches_begin_anew():
         np.testing.assert_allclose(found.rate[:, part], rate.T, atol=1e-6)
 
 
-def test_the_parts_of_a_rigid_torque_are_gravity_inertia_and_speed(rng):
-    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), joints=JOINTS)
-    pi = model.standard_parameters()
-    pi[model.layout.n_inertial :] = 5.0  # drives, which have no part
-    q, v, a = rng.uniform(-1, 1, (3, 5, 3))
-    gravity, inertia, speed = rigid_parts(model, pi, q, v, a)
-    engine, data = model.pin_model, model.pin_model.createData()
-    for k, x in enumerate(model.configurations(q)):
-        np.testing.assert_allclose(
-            gravity[k], pin.computeGeneralizedGravity(engine, data, x), atol=1e-10
-        )
-        M = pin.crba(engine, data, x)
-        M = np.triu(M) + np.triu(M, 1).T
-        np.testing.assert_allclose(inertia[k], M @ a[k], atol=1e-10)
-        C = pin.computeCoriolisMatrix(engine, data, x, v[k])
-        np.testing.assert_allclose(speed[k], C @ v[k], atol=1e-10)
-    impossible = pi.copy()
-    impossible[0], impossible[1] = 0.0, 0.7  # a moment without a mass
-    parts = rigid_parts(model, impossible, q, v, a)
-    more = rigid_parts(model, impossible - pi, q, v, a)
-    for one, other, change in zip(parts, (gravity, inertia, speed), more, strict=True):
-        np.testing.assert_allclose(one, other + change, atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("terms", "depends"),
     [((Presliding(),), False), ((LoadFriction(),), True), ((Lag(), Presliding()), True)],
@@ -89,9 +65,8 @@ def test_motions_that_were_kept_are_not_those_of_another_reference(ur5, rng):
     m = motion(ur5, rng, samples=40)
     pi = model.standard_parameters()
     pi[model.layout.n_inertial :] = 0.5
-    heavier = model.with_reference(
-        np.where(np.arange(len(pi)) < model.layout.n_inertial, 2, 3) * pi
-    )
+    factors = np.where(np.arange(len(pi)) < model.layout.n_inertial, 2, 3)
+    heavier = model.with_reference(factors * pi)
     first, again = (drive_motion_along(model.with_reference(pi), m) for _ in range(2))
     assert first is again
     other = drive_motion_along(heavier, m)

@@ -34,12 +34,9 @@ def vectors(model, rng):
 
 
 def assert_is_regressor_times(model, parameters, trajectory, **options):
-    W = joint_torque_regressor(
-        model, trajectory.q, trajectory.v, trajectory.a, trajectory.direction
-    )
-    for torque, pi in zip(
-        predict(model, parameters, trajectory, **options), parameters, strict=True
-    ):
+    m, torques = trajectory, predict(model, parameters, trajectory, **options)
+    W = joint_torque_regressor(model, m.q, m.v, m.a, m.direction)
+    for torque, pi in zip(torques, parameters, strict=True):
         expected = (W @ pi).reshape(torque.shape)
         np.testing.assert_allclose(torque, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
@@ -93,9 +90,8 @@ def test_an_instant_is_predicted_as_by_inverse_dynamics_and_the_formulas_of_fric
     still = predict_instants(ur5, ur5.standard_parameters(), m.q, 0 * m.v, 0 * m.a)
     np.testing.assert_array_equal(at_rest, still)
     many = np.tile(m.q, (20, 1))  # more than are computed at once
-    np.testing.assert_array_equal(
-        predict_instants(ur5, ur5.standard_parameters(), many)[-40:], at_rest
-    )
+    last = predict_instants(ur5, ur5.standard_parameters(), many)[-40:]
+    np.testing.assert_array_equal(last, at_rest)
 
 
 def test_a_static_robot_is_predicted_by_gravity_and_the_sign_of_friction(rng):
@@ -120,19 +116,13 @@ def test_instants_of_another_shape_are_refused(ur5):
 
 
 SLOPED = {
-    "in another order": (
-        "ur5_robot.urdf",
+    "in another order": ("ur5_robot.urdf",
         {"joints": ["wrist_1_joint", "shoulder_lift_joint", "elbow_joint"],
-         "locked": {"wrist_2_joint": 0.7}, "gravity": (1.0, -2.0, -9.0)},
-    ),
-    "fingers that slide together": (
-        "panda.urdf",
-        {"joints": ["panda_finger_joint1", "panda_joint6", "panda_joint4"], "mimic": "coupled"},
-    ),
-    "two legs": (
-        "solo12.urdf",
-        {"joints": ["HR_HFE", "FL_HAA", "FL_KFE"], "locked": {"FL_HFE": 0.4, "HR_HAA": -0.3}},
-    ),
+         "locked": {"wrist_2_joint": 0.7}, "gravity": (1.0, -2.0, -9.0)}),
+    "fingers that slide together": ("panda.urdf",
+        {"joints": ["panda_finger_joint1", "panda_joint6", "panda_joint4"], "mimic": "coupled"}),
+    "two legs": ("solo12.urdf",
+        {"joints": ["HR_HFE", "FL_HAA", "FL_KFE"], "locked": {"FL_HFE": 0.4, "HR_HAA": -0.3}}),
 }  # fmt: skip
 H = 1e-6
 

@@ -93,9 +93,8 @@ def test_drives_of_a_transmission_are_what_its_motors_take(ur5, rng):
 @pytest.mark.parametrize("free_flyer", [False, True])
 def test_support_is_where_the_regressor_can_be_non_zero(free_flyer, rng):
     coupling = Coupling("motor", (("wrist_2_joint", 1.0), ("wrist_3_joint", 0.5)))
-    model = RobotModel.from_urdf(
-        example_urdf("ur5_robot.urdf"), free_flyer=free_flyer, couplings=(coupling,)
-    )
+    options = {"free_flyer": free_flyer, "couplings": (coupling,)}
+    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), **options)
     W = random_regressor(model, 30, rng).reshape(30, model.n_rows, -1)
     seen = np.abs(W).max(axis=0) > 1e-12
     assert not (seen & ~model.support).any()
@@ -119,9 +118,8 @@ def test_a_problem_streams_the_regressor_in_blocks_as_often_as_wanted(ur5, rng):
         blocks = list(problem.blocks())
         assert len(blocks) == 3
         np.testing.assert_array_equal(np.vstack([block[0] for block in blocks]), W)
-        np.testing.assert_array_equal(
-            np.concatenate([block[1] for block in blocks]), motion.tau.reshape(-1)
-        )
+        tau = np.concatenate([block[1] for block in blocks])
+        np.testing.assert_array_equal(tau, motion.tau.reshape(-1))
 
 
 def test_a_trajectory_of_other_joints_is_refused(ur5, panda, rng):

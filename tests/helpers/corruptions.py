@@ -51,10 +51,10 @@ def controlled_log(name, seed, *, rate=100.0, duration=20.0):
 
 @dataclass(frozen=True)
 class Case:
-    """A log file's table, the robot it is said to be of, and what must be found."""
+    """How a log's table is changed, the robot it is said to be of, and what must be found."""
 
     codes: tuple
-    change: object  # table -> table
+    change: object = staticmethod(lambda table: table)
     urdf: str = "ur5_robot.urdf"
     gravity: tuple = (0.0, 0.0, -9.81)
 
@@ -112,12 +112,8 @@ def held(prefix, length):
     return column(prefix, lambda x, _t: x[np.arange(len(x)) // length * length])
 
 
-def unsigned(prefix):
-    return column(prefix, lambda x, _t: np.abs(x))
-
-
-def noise(x, _t):
-    return x.std() * np.random.default_rng(0).standard_normal(len(x))
+def size(x, _t):
+    return np.abs(x)
 
 
 def differenced(bits, name):
@@ -143,19 +139,10 @@ def compensated(table):
     return {name: x - torques.get(name, 0.0) for name, x in table.items()}
 
 
-def stepped(seconds):
-    return column("time", lambda x, t: x + np.where(t > 8.0, seconds, 0.0))
-
-
 def stale(table):
     kept = np.arange(len(table["time"]))
     kept[1::5] -= 1  # every fifth row repeats the one before
     return {name: x if name == "time" else x[kept] for name, x in table.items()}
-
-
-def exchanged(x, _t):
-    x[[700, 701]] = x[[701, 700]]
-    return x
 
 
 A, B = "shoulder_lift_joint", "wrist_1_joint"
@@ -183,18 +170,20 @@ CASES = {
     "one velocity halved": Case(("velocity_scale",), scaled("dq_elbow", 0.5)),
     "velocity in rpm": Case(("velocity_scale",), scaled("dq_", 9.5493)),
     "dead velocity channel": Case(("velocity_scale",), scaled("dq_elbow", 0.0)),
-    "one velocity replaced by noise": Case(("velocity_mismatch",), column("dq_elbow_joint", noise)),
+    "one velocity replaced by noise": Case(("velocity_mismatch",), column("dq_elbow_joint",
+        lambda x, _t: x.std() * np.random.default_rng(0).standard_normal(len(x)))),
     "velocity of a 12-bit encoder": Case(("quantised",), differenced(12, "dq_elbow_joint")),
     "milliseconds": Case(("time_unit",), scaled("time", 1000)),
     "nanoseconds since 1970": Case(("time_unit",), column("time",
         lambda x, _t: np.round((x + 1.7e9) * 1e9))),
-    "clock set by 1e6 s": Case(("clock_step",), stepped(1e6)),
-    "clock set by 2 s": Case(("clock_step",), stepped(2.0)),
+    "clock set by 1e6 s": Case(("clock_step",), column("time", lambda x, t: x + 1e6 * (t > 8.0))),
+    "clock set by 2 s": Case(("clock_step",), column("time", lambda x, t: x + 2.0 * (t > 8.0))),
     "NaN torque": Case(("not_finite",), column("tau_elbow_joint", set_rows(300, np.nan))),
     "NaN position": Case(("not_finite",), column("q_elbow_joint", set_rows(300, np.nan))),
     "duplicate stamp": Case(("duplicate_stamp",), rows(
         lambda x: np.insert(x, 500, x[500]))),
-    "swapped stamps": Case(("stamp_order",), column("time", exchanged)),
+    "swapped stamps": Case(("stamp_order",), column("time",
+        lambda x, t: set_rows([700, 701], x[[701, 700]])(x, t))),
     "gap of 1 s": Case(("gap",), rows(
         lambda x: np.delete(x, slice(len(x) * 9 // 20, len(x) // 2)))),
     "torque delayed by 30 ms": Case(("torque_delay",), late("tau_", 0.03)),
@@ -203,8 +192,8 @@ CASES = {
         lambda x, _t: np.minimum(x, np.quantile(x, 0.9)))),
     "dead torque channel": Case(("constant_torque",), column("tau_wrist_2_joint",
         lambda x, _t: np.full_like(x, 3.0))),
-    "torques without their sign": Case(("unsigned_torque",), unsigned("tau_")),
-    "one torque without its sign": Case(("unsigned_torque",), unsigned(f"tau_{B}")),
+    "torques without their sign": Case(("unsigned_torque",), column("tau_", size)),
+    "one torque without its sign": Case(("unsigned_torque",), column(f"tau_{B}", size)),
     "torques held for 5 rows": Case(("repeated_torque",), held("tau_", 5)),
     "one torque held for 3 rows": Case(("repeated_torque",), held("tau_elbow", 3)),
     "gravity-compensated torques": Case(("gravity_compensated",), compensated),
@@ -215,14 +204,12 @@ CASES = {
         lambda x, _t: np.round(x / np.ptp(x) * 20) * np.ptp(x) / 20)),
     "currents for torques": Case(("current_for_torque",), scaled("tau_", 0.08)),
     "one current for torque": Case(("current_for_torque",), scaled(f"tau_{A}", 0.08)),
-    "URDF of a UR10": Case(("urdf_mismatch",), lambda table: table, urdf="ur10_robot.urdf"),
+    "URDF of a UR10": Case(("urdf_mismatch",), urdf="ur10_robot.urdf"),
     # five times the torque at the same motion: by the log alone, a gain or another robot
-    "URDF of a UR3": Case(("urdf_mismatch", "current_for_torque"), lambda table: table,
-        urdf="ur3_robot.urdf"),
-    "gravity stated along x": Case(("gravity",), lambda table: table, gravity=(9.81, 0.0, 0.0)),
-    "gravity stated upside down": Case(("gravity",), lambda table: table, gravity=(0, 0, 9.81)),
-    "gravity stated 15 deg off": Case(("gravity",), lambda table: table,
-        gravity=(2.54, 0.0, -9.476)),
+    "URDF of a UR3": Case(("urdf_mismatch", "current_for_torque"), urdf="ur3_robot.urdf"),
+    "gravity stated along x": Case(("gravity",), gravity=(9.81, 0.0, 0.0)),
+    "gravity stated upside down": Case(("gravity",), gravity=(0, 0, 9.81)),
+    "gravity stated 15 deg off": Case(("gravity",), gravity=(2.54, 0.0, -9.476)),
     "missing torque column": Case(("missing_column",), without("tau_elbow_joint")),
     "position offset by 0.5 rad": Case(("position_offset",), column(f"q_{A}",
         lambda x, _t: x + 0.5)),

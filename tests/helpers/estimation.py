@@ -81,11 +81,7 @@ def still_wrist(model, rng):
 
 
 def _descent(kind, passes=10):
-    def make(case):
-        rng = np.random.default_rng(0)
-        return kind(case.sigma, average=False, passes=passes, rng=rng)
-
-    return make
+    return lambda case: kind(case.sigma, average=False, passes=passes, rng=np.random.default_rng(0))
 
 
 def _kalman(case):

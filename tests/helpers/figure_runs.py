@@ -81,9 +81,10 @@ def arm(folder):
     }  # fmt: skip
     for path in folder.glob("*.csv"):
         path.write_text(path.read_text().replace("tau_swing", "M1", 1))
-    turned = (folder / "faulty.csv").read_text().replace("tau_lift", "tau_", 1)
-    turned = turned.replace("tau_roll", "tau_lift", 1).replace("tau_,", "tau_roll,", 1)
-    (folder / "faulty.csv").write_text(turned)  # two torques exchanged
+    head, rows = (folder / "faulty.csv").read_text().split("\n", 1)  # two torques exchanged:
+    names = {"tau_lift": "tau_roll", "tau_roll": "tau_lift"}
+    head = ",".join(names.get(name, name) for name in head.split(","))
+    (folder / "faulty.csv").write_text(f"{head}\n{rows}")
     runs.run("doctor", "doctor @job.toml --verbose")
     runs.run("identify", "identify @job.toml --out @out --verbose")
     found = runs.keep("result.json", "out/result.json")
@@ -92,11 +93,8 @@ def arm(folder):
     runs.keep("sidecar", "out/hoist.identified.drive.json")
     runs.run("validate", "validate @out @later.csv")
     runs.run("validate --json", "validate @out @later.csv @faulty.csv --json", code=None)
-    for form, file in (
-        ("mjcf", "x.xml"),
-        ("sdf", "x.sdf"),
-        ("urdf", "x.urdf"),
-        ("ranges", "r.yaml"),
+    for form, file in zip(
+        ("mjcf", "sdf", "urdf", "ranges"), ("x.xml", "x.sdf", "x.urdf", "r.yaml"), strict=True
     ):
         runs.run(f"export {form}", f"export @out --format {form} --out @{file}")
         runs.keep(f"exported {form}", file)

@@ -105,14 +105,8 @@ def own(drive, q, v, a, rigid):
     """Return the torque of a drive at some speeds."""
     hook = drive.stribeck * np.exp(-np.abs(v) / WIDTH)
     friction = (drive.coulomb + drive.load * np.abs(rigid) + hook) * np.sign(v)
-    return (
-        drive.armature * a
-        + drive.viscous * v
-        + friction
-        + drive.offset
-        + drive.spring * q
-        + (drive.ripple * np.cos(2 * q + 0.4))
-    )
+    rest = drive.offset + drive.spring * q + drive.ripple * np.cos(2 * q + 0.4)
+    return drive.armature * a + drive.viscous * v + friction + rest
 
 
 def _configuration(model, q):

@@ -32,8 +32,6 @@ from robotid.data.files.read import write_log
 from robotid.estimation.fitting.estimator_settings import ESTIMATORS
 from robotid.robot.model import RobotModel
 
-__all__ = ["KINDS"]
-
 URDF = str(URDF_FOLDER / "planar_2r.urdf")
 JOINTS = ("joint_1", "joint_2")
 COLUMNS = ["time", *(f"{kind}_{joint}" for kind in ("q", "dq", "tau") for joint in JOINTS)]

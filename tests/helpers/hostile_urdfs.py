@@ -1,6 +1,6 @@
 """Hostile URDFs of every kind, and what is done with each: a traceback is a failure.
 
-``tests/robot/test_hostile_urdfs.py`` tries some, ``benchmarks/bench_fuzz.py`` thousands.
+``tests/robot/test_model.py`` tries some, ``benchmarks/bench_fuzz.py`` thousands.
 """
 
 import contextlib
@@ -21,8 +21,6 @@ from robotid.output.viewer.replays import robot_scene
 from robotid.robot.bodies import body_boxes
 from robotid.robot.mass_matrix import check_mass_matrix
 from robotid.robot.model import RobotModel
-
-__all__ = ["HostileUrdf", "run_urdf", "urdf_inputs"]
 
 LONGEST = 20_000  # characters of a message: longer ones are no words
 

@@ -3,8 +3,6 @@
 import os
 from pathlib import Path
 
-__all__ = ["DOCS", "IN_CI", "JOBS", "ROOT", "URDF"]
-
 ROOT = Path(__file__).resolve().parents[2]
 JOBS = ROOT / "tests" / "jobs"
 DOCS = ROOT / "docs"

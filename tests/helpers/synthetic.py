@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from robotid.data.log import Log
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Controller, Payload, Sensors, Simulation
 from robotid.dynamics.simulation.simulator import Noise, another_robot, simulate
@@ -48,3 +49,11 @@ def payload_log(model, rng, *, mass=2.0, at=10.0, duration=15.0, rate=200.0, noi
         model, truth(model), motion, rng, rate=rate, duration=duration, sensors=sensors,
         payload=load,
     )  # fmt: skip
+
+
+def sine_log(count=60, rate=50, **changes):
+    """Return a log of two joints that swing, from 1000 s on."""
+    t = 1000.0 + np.arange(count) / rate
+    phase = t[:, None] * [2.0, 3.0]
+    swing = {"q": np.sin(phase), "v": np.cos(phase) * [2.0, 3.0], "tau": 10 * np.cos(phase)}
+    return Log(**({"t": t, "joints": ("shoulder", "elbow")} | swing | changes))

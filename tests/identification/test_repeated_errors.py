@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
+import scipy.linalg
 
 from robotid.data.base_motion import BaseMotion, ImuFrame, ImuMotion
 from robotid.data.log import Log
@@ -15,6 +16,8 @@ from robotid.dynamics.prepared_logs import base_problem
 from robotid.dynamics.torque import predict
 from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.identification.repeated_errors import (
+    EstimatedErrors,
+    _roots,
     _shift,
     _shift_of_motion,
     _slopes,
@@ -136,6 +139,15 @@ def test_the_size_of_offsets_is_that_of_the_density_of_the_rows(rng):
     np.testing.assert_allclose(
         found.squares - np.outer(mean, mean), np.linalg.inv(H)[5:, 5:], rtol=0.05, atol=2e-10
     )
+
+
+def test_offsets_of_unknown_size_have_the_mean_square_of_all_points(rng):
+    x, one = rng.standard_normal((20, 6)), 0.3 * np.eye(1)
+    fit = EstimatedErrors(0.1, np.zeros(7), np.diag([0.0] * 6 + [0.09]), x.T @ x)
+    root = _roots(fit, np.array([np.nan] * 6 + [0.5]), 6)
+    mean = (x[:, :3].T @ x[:, :3] + x[:, 3:].T @ x[:, 3:]) / 2
+    wanted = scipy.linalg.block_diag(mean, mean, one**2)
+    np.testing.assert_allclose(root @ root.T, wanted, atol=1e-12)
 
 
 def test_a_drift_is_neither_the_speed_at_the_ends_nor_that_of_a_walk():

@@ -287,7 +287,8 @@ class LogLayout:
             if not self.motors[kind][places[0]]:
                 continue
             own = values[:, places].T
-            moved = gear.to_torque @ own if kind in TORQUES else np.linalg.solve(gear.T, own)
+            to_torque = gear.T.T * (gear.efficiency or 1.0)  # T^T diag(efficiency)
+            moved = to_torque @ own if kind in TORQUES else np.linalg.solve(gear.T, own)
             if kind in ("q", "qref") and gear.offset:
                 moved += np.array(gear.offset)[:, None]
             values[:, places] = moved.T

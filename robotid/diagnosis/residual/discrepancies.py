@@ -198,16 +198,16 @@ def _accepted(
     def complexity(one: _Alteration) -> tuple[int, int]:
         return len(offered[one]), len(one.joints)  # number of sizes, and of joints named
 
-    for found in trials.accepted(offered, decisions.ALTERATION, complexity):
-        best, size, error = found.option, found.theta, np.sqrt(np.diag(found.covariance))
-        least = best.reading.least * _needed(found)
+    for accepted in trials.accepted(offered, decisions.ALTERATION, complexity):
+        best, size, error = accepted.option, accepted.theta, np.sqrt(np.diag(accepted.covariance))
+        least = best.reading.least * _needed(accepted)
         if np.linalg.norm(size) < max(least, decisions.SIGNIFICANT * float(np.linalg.norm(error))):
             return
         corrected = sample
-        if best.reading.applied is not None and len(found.columns) == len(size):
+        if best.reading.applied is not None and len(accepted.columns) == len(size):
             applied = partial(best.reading.applied, best.on)
             size, error, corrected = _refined(applied, size, fit.standard, sample)
-        others = [one for one in found.others if one.joints]
+        others = [one for one in accepted.others if one.joints]
         unit = "m" if fit.model.layout.prismatic.intersection(best.joints) else "rad"
         norm, norm_error = float(np.linalg.norm(size)), float(np.linalg.norm(error))
         angle, angle_error = np.degrees(np.arctan([norm, norm_error]))
@@ -215,22 +215,22 @@ def _accepted(
             best.reading.code, "", best.joints, subject="" if best.joints else "all joints",
             severity="warning", explained=True, also=bool(others),
             others=listed(f"{one.reading.code} of {', '.join(one.joints)}" for one in others),
-            size=float(size[0] if len(size) == 1 else norm), share_pct=100 * found.share,
+            size=float(size[0] if len(size) == 1 else norm), share_pct=100 * accepted.share,
             std_error=norm_error, angle=angle, angle_error=angle_error, **best.values(size, unit),
         )  # fmt: skip
         yield best, explained, corrected
 
 
-def _needed(found: Accepted[_Alteration]) -> float:
+def _needed(accepted: Accepted[_Alteration]) -> float:
     """Return the size that an alteration needs, over its least; inf if it is not significant."""
-    share, confirmed = found.share, found.confirmed
-    if found.p_value > decisions.P_VALUE:
+    share, confirmed = accepted.share, accepted.confirmed
+    if accepted.p_value > decisions.P_VALUE:
         return np.inf
     if share >= decisions.LEAST_SHARE:
         is_confirmed = confirmed is None or confirmed > decisions.CONFIRMED * share
         return 1.0 if is_confirmed else np.inf
     is_weak = confirmed is not None and confirmed > share > decisions.WEAK
-    is_weak = is_weak and found.p_value < decisions.WEAK_P_VALUE
+    is_weak = is_weak and accepted.p_value < decisions.WEAK_P_VALUE
     return decisions.WEAK_SIZE if is_weak else np.inf
 
 

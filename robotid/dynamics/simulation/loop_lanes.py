@@ -215,13 +215,11 @@ def _balance(work, at, robot, step, now):
 
 @compiled
 def _solve(work, at, robot, step, now):
-    """Solve a step for its speeds u and leave the factor of H; return whether it converged.
-
-    Friction that falls with speed faster than the inertia of a step allows makes H indefinite and
-    several speeds possible. Steps without this fall then lead to the one next to the speed before.
-    """
+    """Solve a step for its speeds u and leave the factor of H; return whether it converged."""
     if _newton(work, at, robot, step, now, False):
         return True
+    # friction that falls faster than inertia allows makes H indefinite and several u possible:
+    # steps without this fall lead to the one next to the speed before
     for i in range(at.n):
         put(work, at.u + i, get(work, at.v + i))
     _newton(work, at, robot, step, now, True)
@@ -425,10 +423,7 @@ def _drive_column(work, at, robot, step, now, column):
 
 @compiled
 def _combine(work, at, drives, step):
-    """Write the derivatives of a step's equation by position and speed before it: T_q and T_v.
-
-    H du = T_v dv - T_q dq - own, each row divided by its e.
-    """
+    """Write T_q and T_v of H du = T_v dv - T_q dq - own, each row divided by its e."""
     n, T_q, T_v = at.n, at.T_q, at.T_v
     span, rate = THETA * step, 1.0 / (THETA * step)
     for i in range(n):
@@ -531,8 +526,7 @@ def roll_out(robot, columns, course, out, work, at, corrects):
 def coded_term(term: DriveTerm) -> tuple[tuple[int, ...], tuple[float, ...]]:
     """Return a term for ``term`` and ``deflection``: five codes and eleven numbers.
 
-    Addresses of its laws of speed and position (or 0), kind, counts of shape parameters; numbers:
-    four of these for each law, and the ranges.
+    Codes: addresses of its laws of speed and position (or 0), kind, counts of their shapes.
     """
     if isinstance(term, Bristles):
         return (0, 0, BRISTLES, 0, 0), (*term.numbers, *[0.0] * 8)

@@ -187,11 +187,6 @@ class ClosedLoopRobot:
         self._parts = _parts(flatten(model))
 
     @property
-    def parts(self) -> tuple[Array, ...]:
-        """The joints of each independent part."""
-        return tuple(part.joints for part in self._parts)
-
-    @property
     def joint_of_body(self) -> tuple[int, ...]:
         """The joint that moves each body of the layout."""
         bodies, joints = (np.concatenate([part[k] for part in self._parts]) for k in (1, 0))

@@ -43,10 +43,7 @@ class FourierTrajectory(Motion):
 
 @dataclass(frozen=True)
 class ProgramMotion(Motion):
-    """The motion q(t) = q0 + A (6 s^5 - 15 s^4 + 10 s^3), s = t / T (Tzvetkova, (28)).
-
-    Velocity and acceleration are zero at both ends; before 0 and after T the robot is at rest.
-    """
+    """The motion q0 + A (6 s^5 - 15 s^4 + 10 s^3), s = t / T within 0 and 1 (Tzvetkova, (28))."""
 
     amplitude: Array  # A, displacement of each joint, (n,), or (R, n) for R motions [rad or m]
     duration: float | Array  # T, one for all or one per motion, shape () or (R,) [s]

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.files import missing_file
@@ -250,17 +251,20 @@ class Simulation(Settings):
             )
 
 
-def by_joint(value: PerJoint | None, joints: Sequence[str], name: str, other: float = 0.0) -> Array:
-    """Return a setting of each joint, shape (n,)."""
+def by_joint(
+    value: PerJoint | None, joints: Sequence[str], name: str, other: ArrayLike = 0.0
+) -> Array:
+    """Return a setting of each joint, shape (n,): other if it is not stated."""
     if not isinstance(value, Mapping):
-        return np.full(len(joints), other if value is None else float(value))
+        return np.array(np.broadcast_to(other if value is None else value, len(joints)), float)
     for joint in value:
         if joint not in joints:
             raise SettingsError(
                 f"{name} is stated for {joint!r}, which is not a moving joint: "
                 f"{listed(joints)}{suggestion(joint, joints)}"
             )
-    return np.array([float(value.get(joint, other)) for joint in joints])
+    others = zip(joints, np.broadcast_to(other, len(joints)), strict=True)
+    return np.array([float(value.get(joint, x)) for joint, x in others])
 
 
 def read_simulation(

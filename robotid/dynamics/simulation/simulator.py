@@ -45,7 +45,8 @@ _SIGN_SPEED = 2e-4  # speed over which the plant's Coulomb friction reverses [ra
 _TYPICAL_EFFORT = 50.0  # effort limit of a drive with typical parameters [N m or N]
 _IMPOSSIBLE = -1e-9  # smallest eigenvalue of a body's pseudo-inertia over the largest
 
-# ROS34PW2, a Rosenbrock W-method: order 3 for any Jacobian approximation, L-stable
+# ROS34PW2, a Rosenbrock W-method: order 3 for any Jacobian approximation, L-stable, stable with
+# stiction (Rang, Angermann 2005, New Rosenbrock W-methods)
 _GAMMA = 4.3586652150845900e-01
 _ALPHA = np.zeros((4, 4))
 _ALPHA[1, 0] = 8.7173304301691801e-01
@@ -100,11 +101,7 @@ def follow(
     settings: Simulation,
     progress: ProgressCallback = ignore_progress,
 ) -> Run:
-    """Return the exact motion of a robot, a ``RobotPlant``, that tracks a motion.
-
-    With elastic gears, rotor and friction are on the motor's side. The Rosenbrock W-method of order
-    3 is stable with stiction (Rang, Angermann 2005, New Rosenbrock W-methods).
-    """
+    """Return the exact motion of a plant that tracks a motion; friction is on the motor's side."""
     _check_size(duration * rate, 1)
     t = np.arange(round(duration * rate) + 1) / rate
     loaded = carried(model, pi, settings.payload)
@@ -247,9 +244,8 @@ class Friction:
 class RobotPlant:
     """The plant M(q) a + b(q, v) + Ia a + Fv v + Fc sign(v) + off = u of a robot.
 
-    The drives have the terms of the model; sign(v) is tanh(v / 0.2 mm/s). Load-dependent friction
-    uses the load of the same instant. The bristle deflection z is a state with ``bristle_rate``; if
-    it is not given, sliding is steady. A ``Lag`` is one of the measurement. q, v, u (n,), pi (p,).
+    sign(v) is tanh(v / 0.2 mm/s). Load-dependent friction uses the load of the same instant. The
+    bristle deflection z is a state; not given: steady. A ``Lag`` is one of the measurement.
     """
 
     def __init__(self, model: RobotModel, pi: Array) -> None:
@@ -407,13 +403,12 @@ class _Loop:
         self.controller = _Torque(model, settings.controller, mass)
         share = settings.actuator.effort or 0.0
         urdf = [share * max(joint.effort, 0.0) or np.inf for joint in model.limits]
-        limits = by_joint(settings.actuator.limits, model.joints, "actuator: limits", np.nan)
-        self.limit = np.where(np.isnan(limits), urdf, limits)  # [N m or N]
+        stated = settings.actuator.limits
+        self.limit = by_joint(stated, model.joints, "actuator: limits", urdf)  # [N m or N]
         self.has_limits, self.n = bool(np.isfinite(self.limit).any()), len(model.joints)
         self.is_at_motor = settings.sensors.side == "motor"
-        self.gear = (
-            _Gear(plant, settings.actuator) if settings.actuator.stiffness is not None else None
-        )
+        actuator = settings.actuator
+        self.gear = None if actuator.stiffness is None else _Gear(plant, actuator)
         self.longest_step = self._longest_step()
 
     def start(self, q: Array, v: Array, a: Array) -> Array:
@@ -568,14 +563,9 @@ class _Torque:
         self.kind, self.w = settings.kind, settings.bandwidth
         self.nominal = RobotPlant(model, model.standard_parameters())
         inertia = np.maximum(mass.diagonal(), _LEAST_INERTIA)
-        stated = [
-            by_joint(x, model.joints, f"controller: {name}", np.nan)
-            for name, x in (("kp", settings.kp), ("kd", settings.kd))
-        ]
         default = inertia * self.w**2, 2 * inertia * self.w
-        self.kp, self.kd = (
-            np.where(np.isnan(x), y, x) for x, y in zip(stated, default, strict=True)
-        )
+        self.kp = by_joint(settings.kp, model.joints, "controller: kp", default[0])
+        self.kd = by_joint(settings.kd, model.joints, "controller: kd", default[1])
 
     def feedforward(self, q: Array, v: Array, a: Array) -> Array:
         """Return the feed-forward torque along a motion, shape (N, n)."""

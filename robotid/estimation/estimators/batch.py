@@ -117,13 +117,10 @@ class TLS(BatchEstimator):
         is_exact = [name.endswith(".offset") for name in factors.names]  # constant columns
         theta, share = self._split(R, np.where(is_exact, 0.0, noise), wls.theta)
         freedom = np.maximum(factors.rows - len(theta) / len(factors.rows), 1.0)
-        return replace(
-            wls,
-            theta=theta,
-            sigma=np.sqrt(factors.residual_squares(theta) / freedom),
-            message=f"total least squares, {wls.message}; {100 * share:.2g} % of the residual's "
-            "variance is noise of the regressor",
-        )
+        sigma = np.sqrt(factors.residual_squares(theta) / freedom)
+        message = f"total least squares, {wls.message}; {100 * share:.2g} % of the residual's "
+        message += "variance is noise of the regressor"
+        return replace(wls, theta=theta, sigma=sigma, message=message)
 
     def _split(self, R: Array, noise: Array, theta: Array) -> tuple[Array, float]:
         """Return the parameters and the share of the residual due to the regressor's noise.

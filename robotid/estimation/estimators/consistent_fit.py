@@ -58,12 +58,6 @@ class Constraints:
     extent: dict[str, Array] = field(default_factory=dict)  # box of all mass, (2, 3) [m]
     relaxed: tuple[str, ...] = ()  # bodies whose extent was removed: the data contradict it
 
-    def without_extent(self, bodies: Iterable[str]) -> "Constraints":
-        """Return the same constraints without the extents of some bodies."""
-        relaxed = tuple(body for body in self.extent if body in set(bodies))
-        others = {body: box for body, box in self.extent.items() if body not in relaxed}
-        return replace(self, extent=others, relaxed=(*self.relaxed, *relaxed))
-
     def check(self, layout: ParameterLayout, prior: Array, held: Array) -> None:
         """Refuse unknown bodies and bounds that contradict each other, before the solver runs."""
         known = {*self.mass, *self.com, *self.extent, *self.pinned}
@@ -237,6 +231,14 @@ class Consistent(BatchEstimator):
         wls = solve_factor(factors, sigma, self.K @ self.prior)
         least_squares = wls.estimate(factors.names, wls.covariance, sigma, 0, "")
         return self._minimised(self.rows(factors, sigma), least_squares)
+
+    def without_extent(self, bodies: Iterable[str]) -> "Consistent":
+        """Return the same fit without the extents of some bodies."""
+        bounds, bodies = self.constraints, set(bodies)
+        relaxed = tuple(body for body in bounds.extent if body in bodies)
+        others = {body: box for body, box in bounds.extent.items() if body not in bodies}
+        bounds = replace(bounds, extent=others, relaxed=(*bounds.relaxed, *relaxed))
+        return replace(self, constraints=bounds)
 
     def project(self, estimate: Estimate) -> Estimate:
         """Return the physically consistent standard parameters nearest to an estimate.
@@ -526,7 +528,7 @@ def contradicted_extents(fit: Consistent, segments: Segments) -> tuple[str, ...]
     standard errors and 2 % of the mean square error.
     """
     bounds, rows, count = fit.programme.bounds, segments.rows, len(segments.folds)
-    free = replace(fit, constraints=fit.constraints.without_extent(fit.constraints.extent))
+    free = fit.without_extent(fit.constraints.extent)
     try:
         solution = free.programme.minimise(rows, 1.0, is_exact=False)
     except NotConvergedError:  # bodies diverge: this contradicts no extent

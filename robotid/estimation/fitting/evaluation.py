@@ -113,14 +113,12 @@ class TorqueSums:
     def _joint(self, j: int, unit: str) -> JointMetrics:
         residual, spread = float(self.residual[j]), float(self.spread[j])
         return JointMetrics(
-            rmse=float(np.sqrt(residual / self.rows[j])),
-            unit=unit,
+            rmse=float(np.sqrt(residual / self.rows[j])), unit=unit, rows=int(self.rows[j]),
             relative_error_pct=self._relative_error(j, residual),
             r2=1.0 - residual / spread if spread > 0 else 0.0,
-            rows=int(self.rows[j]),
             baselines={x: self._relative_error(j, float(s[j])) for x, s in self.baselines.items()},
             better_than_constant=residual < spread,
-        )
+        )  # fmt: skip
 
     def _relative_error(self, j: int, residual: float) -> float | None:
         return 100.0 * float(np.sqrt(residual / self.torque[j])) if self.torque[j] > 0 else None
@@ -324,14 +322,11 @@ def _score(
     every = _sampled_every(stop - first)
     return _Score(
         sums={x: TorqueSums.of(motion.tau, torques[x], measured, baselines) for x in parameters},
-        smooth=len(motion.t),
-        used=int(mask.sum()),
+        smooth=len(motion.t), used=int(mask.sum()), turned=rows.turned, shown=shown,
         segments=frozenset(np.unique(motion.segment).tolist()),
-        turned=rows.turned,
-        shown=shown,
         sampled=recorded[(first - piece.first) % every :: every],
         found=tuple(_rows_in(sampled, recorded) for sampled in sought),
-    )
+    )  # fmt: skip
 
 
 def _shown_rows(piece: LogPiece) -> slice | None:
@@ -367,15 +362,13 @@ def _evaluation_of(
     """Return the evaluation of a log from the results of its pieces."""
     shown = [score.shown for score in scores if score.shown is not None]
     motions, masks, torques = zip(*shown, strict=True)
+    start, end = (float(log.stamps[k]) for k in (log.first, log.stop - 1))
     extent = Extent(
-        samples=log.stop - log.first,
-        rate=1.0 / log.step,
-        start=float(log.stamps[log.first]),
-        end=float(log.stamps[log.stop - 1]),
+        log.stop - log.first, 1.0 / log.step, start, end,
         smooth=sum(score.smooth for score in scores),
         rows_used=sum(score.used for score in scores),
         segments=len(frozenset.union(*(score.segments for score in scores))),
-    )
+    )  # fmt: skip
     head, model = log.head, log.model
     turned = np.any([score.turned for score in scores], axis=0)
     if turned.any():

@@ -151,12 +151,12 @@ def consistent_fit(choice: BoundedSettings, known: Known) -> Consistent:
         return fit
     segments = Segments.of(fit, folds)
     if extent and (beyond := contradicted_extents(fit, segments)):
-        fit = replace(fit, constraints=fit.constraints.without_extent(beyond))
+        fit = fit.without_extent(beyond)
     if not how:
         return fit
     weight = choose_weight(fit, segments, how, known.repeated)
     if fit.constraints.extent and weight.loss > AS_GOOD:
-        unbound = replace(fit, constraints=fit.constraints.without_extent(fit.constraints.extent))
+        unbound = fit.without_extent(fit.constraints.extent)
         if AS_GOOD * loss_of(unbound, segments, weight.weight) < weight.loss:
             fit, weight = unbound, choose_weight(unbound, segments, how, known.repeated)
     return replace(

@@ -537,10 +537,11 @@ class Recordings:
         if self.is_in_memory:
             for log in (*self.fitted, *self.validation):  # raises errors before any fit
                 keep_inertial_rows(self.model, log.whole.trajectory)
-            reduced = self._segments if is_cut else self._whole
-            return tuple(
-                tuple(reduced(k, log.whole.trajectory)) for k, log in enumerate(self.fitted)
-            )
+            motions = enumerate(log.whole.trajectory for log in self.fitted)
+            if not is_cut:
+                factors = ((compress(self.problem_of(k, motion)), motion) for k, motion in motions)
+                return tuple((Reduction(R, m.squares, len(m.t)),) for R, m in factors)
+            return tuple(tuple(self._segments(k, motion)) for k, motion in motions)
         work = partial(reduce_piece, mapping=self.mapping)
         by_piece = (self.plan or WorkPlan()).map(work, self.pieces, "reducing")
         size = 8 * self.model.n_rows * (len(self.mapping.independent) + 1) ** 2 * len(self.fitted)
@@ -595,7 +596,3 @@ class Recordings:
         for i, factors in enumerate(self.segments(k, motion)):
             part = motion.at(slice(i * length, (i + 1) * length))
             yield Reduction(factors, part.squares, len(part.t))
-
-    def _whole(self, k: int, motion: Trajectory) -> Iterator[Reduction]:
-        """Yield the reduction of a log in memory."""
-        yield Reduction(compress(self.problem_of(k, motion)), motion.squares, len(motion.t))

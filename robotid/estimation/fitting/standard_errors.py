@@ -105,13 +105,10 @@ def with_wls_errors(estimate: Estimate, wls: Estimate) -> Estimate:
     covariance = wls.covariance + np.outer(distance, distance)
     reason = "standard errors are those of wls plus the distance to it"
     return replace(
-        estimate,
-        covariance=covariance,
-        rank=wls.rank,
-        condition=wls.condition,
+        estimate, covariance=covariance, rank=wls.rank, condition=wls.condition,
         undetermined=wls.undetermined,
         message=estimate.message.split("; a gradient method")[0] + f"; {reason}",
-    )
+    )  # fmt: skip
 
 
 def standard_of(

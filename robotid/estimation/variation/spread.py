@@ -153,15 +153,12 @@ class _Grid:
         z = _GRID - 0.5 * (_FREEDOM + 1.0) * np.log1p(np.exp(2.0 * _GRID) / _FREEDOM)
         variance, every = (scale * np.exp(_GRID)) ** 2, slice(None, None, 2)
         return cls(
-            between=variance[None],
+            between=variance[None], W=W, w=w,
             within=variance[every, None] if several else np.zeros((1, 1)),
             members=unit if several else np.arange(len(unit)),
-            W=W,
-            w=w,
-            prior=(_UNKNOWN * scale) ** -2.0,
-            others=max(others, 0.0),
+            prior=(_UNKNOWN * scale) ** -2.0, others=max(others, 0.0),
             log_prior=z + (z[every, None] if several else 0.0),
-        )
+        )  # fmt: skip
 
     @cached_property
     def of_runs(self) -> Array:
@@ -224,14 +221,12 @@ class _Grid:
         error_after = Mixture.over_grid(after, mean, np.sqrt(more)).moments[1]
         ends_after = Mixture.over_grid(after, mean, np.sqrt(more + spread)).ends
         return Prediction(
-            mean=float(centre),
-            std_error=float(error),
-            spread=median,
-            spread_ends=np.array([low, high]),
+            mean=float(centre), std_error=float(error),
+            spread=median, spread_ends=np.array([low, high]),
             mixture=Mixture.over_grid(weight, mean, np.sqrt(variance + spread)),
             after=(float(error_after), float(np.ptp(ends_after))),
             within=float(self.median(0)[0]) if len(self.within) > 1 else None,
-        )
+        )  # fmt: skip
 
     def values(self) -> tuple[Array, Array]:
         """Return the parameter in each run and its standard error, shape (k,)."""

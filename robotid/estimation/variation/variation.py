@@ -130,14 +130,12 @@ def vary(
     is_alike = ~np.isin(unit[runs_tested], [odd.run for odd in unlike_units])
     drives = [pair for pair in pairs if pair[0].group.kind == "drive"]
     return Variation(
-        runs=tuple(names),
-        units=n_units,
+        runs=tuple(names), units=n_units, of_runs=tuple(unit.tolist()),
         parameters=tuple(x for group, model in drives for x in _parameters(group, model)),
         unlike=tuple(_unlike(pairs, runs_tested[is_alike], n_tests, is_unit=False)),
         unit_names=tuple(units) or tuple(map(str, range(n_units))),
         unlike_units=tuple(unlike_units),
-        of_runs=tuple(unit.tolist()),
-    )
+    )  # fmt: skip
 
 
 def between_covariance(variation: Mapping[str, Any], names: Sequence[str]) -> Array:

@@ -174,16 +174,13 @@ class PositionIdentification(Identification):
     def verdict(self) -> Verdict:
         """The verdict on the result."""
         return judge_positions(
-            pool_positions(self.validation or self.fitted, moving=True),
-            self.model.joints,
-            fitted=pool_positions(self.fitted, moving=True),
-            is_validation=bool(self.validation),
-            is_settled=self.estimate.converged,
-            log_errors=self.log_errors,
+            pool_positions(self.validation or self.fitted, moving=True), self.model.joints,
+            fitted=pool_positions(self.fitted, moving=True), is_validation=bool(self.validation),
+            is_settled=self.estimate.converged, log_errors=self.log_errors,
             cautions=[f.message for f in self.findings if f.code in _CAUTIONS],
             scale=entries()["scale"]["what"]["gains"] if self.is_scaled_by_gain else "",
             knows_torques=self.loop.kind == "torque" or self.fit.simulator.knows_torques,
-        )
+        )  # fmt: skip
 
 
 def identify_loops(
@@ -237,22 +234,14 @@ def identify_loops(
     covariance = slopes @ fitted.estimate.covariance @ slopes.T
     mapping = structural_mapping(extended)
     result = PositionIdentification(
-        model=extended,
-        mapping=mapping,
-        prior=extended.standard_parameters(),
-        standard=standard,
-        standard_covariance=covariance,
-        base=mapping.to_base(standard),
-        base_error=_errors(mapping.K @ covariance @ mapping.K.T),
-        loop=loop,
-        estimator=settings,
-        fit=fitted,
-        fitted=tuple(runs[0]),
-        validation=tuple(runs[1]),
+        model=extended, mapping=mapping, prior=extended.standard_parameters(), standard=standard,
+        standard_covariance=covariance, base=mapping.to_base(standard),
+        base_error=_errors(mapping.K @ covariance @ mapping.K.T), loop=loop, estimator=settings,
+        fit=fitted, fitted=tuple(runs[0]), validation=tuple(runs[1]),
         log_errors=tuple(finding.message for finding in errors),
         stated=StatedSettings(used, ignore=tuple(ignore)),
         variation=vary([log.name for log in logs], of_logs, sorted(set(units))),
-    )
+    )  # fmt: skip
     examined = [*examined, *unlike_findings(result.variation)]
     return replace(result, findings=(*loop_findings(result, examined), *not_written(errors)))
 
@@ -325,13 +314,10 @@ def loop_runs(
         spread = np.where(np.isfinite(spread), spread, 0.0)
         scale = np.maximum(_CHANGE * np.abs(centre), np.maximum(_LEAST * spread, 1e-12))
         group = Group(
-            "drive",
-            members[0].name.rpartition(".")[0],
-            tuple(free.name for free in members),
-            tuple(units_of(model, free) for free in members),
-            np.zeros((0, len(members))),
+            "drive", members[0].name.rpartition(".")[0], tuple(free.name for free in members),
+            tuple(units_of(model, free) for free in members), np.zeros((0, len(members))),
             members[0].joints,
-        )
+        )  # fmt: skip
         inflation = inflation_of(group_scores)
         runs = Runs(H / inflation, h / inflation, units, scale)
         runs_of.append(RunsOf(group, centre, runs, inflation))

@@ -131,13 +131,9 @@ def fit_second_order(
     # a drive bears the load by gravity within its limit
     mean = stated.kp * error.mean(axis=0) * finds_limit
     bare = replace(
-        stated,
-        bodies=np.zeros_like(stated.bodies),
-        zero=np.zeros(n),
-        limit=np.full(n, np.inf),
-        terms=(_TERMS,) * n,
-        values=np.column_stack([np.zeros((n, 2)), mean]).reshape(-1),
-    )
+        stated, bodies=np.zeros_like(stated.bodies), zero=np.zeros(n), limit=np.full(n, np.inf),
+        terms=(_TERMS,) * n, values=np.column_stack([np.zeros((n, 2)), mean]).reshape(-1),
+    )  # fmt: skip
     least, largest = np.abs(mean), stated.kp * np.abs(error).max(axis=0)
     limits = [least + share * (largest - least) for share in _LIMITS]
     limits = limits if finds_limit else [bare.limit]
@@ -294,14 +290,11 @@ def first_loops(
     )
     values = [friction.get(t.name, none)[j] for j, own in enumerate(terms) for t in own]
     return replace(
-        stated,
-        kp=stated.kp * typical.scale,
+        stated, kp=stated.kp * typical.scale,
         armature=np.maximum(typical.inertia - typical.bodies, _LEAST * typical.inertia),
-        delay=plain.loops.delay,
-        limit=np.where(finds_limit, typical.largest, stated.limit),
-        terms=terms,
-        values=np.array(values),
-    )
+        delay=plain.loops.delay, limit=np.where(finds_limit, typical.largest, stated.limit),
+        terms=terms, values=np.array(values),
+    )  # fmt: skip
 
 
 def free_drive_parameters(

@@ -118,13 +118,11 @@ def run_open_loop(
     errors = {h: _error(robot, loops, log, h) for h in lengths}
     return PositionEvaluation(
         log=log,
-        units=tuple("m" if x in robot.model.layout.prismatic else "rad" for x in log.joints),
-        q=q,
-        rmse=np.sqrt(np.nanmean((log.q - q) ** 2, axis=0)),
-        baselines=baselines,
+        units=tuple("m" if x in robot.model.layout.prismatic else "rad" for x in log.joints), q=q,
+        rmse=np.sqrt(np.nanmean((log.q - q) ** 2, axis=0)), baselines=baselines,
         horizons={h: error for h, error in errors.items() if error is not None},
         spread=_size(np.concatenate(moved)) if is_driven else np.std(log.q, axis=0),
-    )
+    )  # fmt: skip
 
 
 def pool_positions(runs: Sequence[PositionEvaluation], *, moving: bool = False) -> Metrics:
@@ -146,14 +144,11 @@ def _joint_metrics(runs: Sequence[PositionEvaluation], j: int) -> JointMetrics:
 
     left = (rmse / size) ** 2 if size > 0 else 1.0
     return JointMetrics(
-        rmse=rmse,
-        unit=runs[0].units[j],
-        relative_error_pct=share([run.rmse for run in runs]),
-        r2=1.0 - left,
-        rows=sum(len(run.log.t) for run in runs),
+        rmse=rmse, unit=runs[0].units[j], relative_error_pct=share([run.rmse for run in runs]),
+        r2=1.0 - left, rows=sum(len(run.log.t) for run in runs),
         baselines={key: share([x.baselines[key] for x in runs]) for key in runs[0].baselines},
         better_than_constant=left < 1.0,
-    )
+    )  # fmt: skip
 
 
 def _mean(values: Iterable[float]) -> float:

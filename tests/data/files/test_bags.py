@@ -23,6 +23,7 @@ from helpers.recorders import (
     write_idl_controller,
     write_mcap,
 )
+from helpers.synthetic import sine_log
 from mcap.writer import Writer as McapLibraryWriter
 
 from robotid.base.exceptions import DataError, SettingsError
@@ -30,7 +31,7 @@ from robotid.cli import main
 from robotid.data.base_motion import BaseColumns, ImuFrame, quaternions_of_angles
 from robotid.data.files import bags
 from robotid.data.files.read import read_log, write_log
-from robotid.data.log import COLUMNS, Log
+from robotid.data.log import COLUMNS
 from robotid.data.signal_settings import LogSource
 
 JOINTS = ("shoulder", "elbow")
@@ -42,23 +43,11 @@ def refused(text):
     return pytest.raises(DataError, match="^" + re.escape(text) + "$")
 
 
-def make_log(count=60, **changes):
+def make_log(**changes):
     """Return a log of commands, without torque."""
-    t = 1000.0 + np.arange(count) / 50
-    phase = t[:, None] * [2.0, 3.0]
-    fields = {
-        "t": t, "q": np.sin(phase), "v": np.cos(phase) * [2.0, 3.0], "tau": np.zeros((count, 2)),
-        "joints": JOINTS, "q_ref": np.sin(phase + 0.1), "v_ref": np.cos(phase + 0.1) * [2.0, 3.0],
-        "tau_ref": 10 * np.cos(phase), "has_torque": False,
-    }  # fmt: skip
-    return Log(**(fields | changes))
-
-
-def measured(**changes):
-    """Return a log of torques, without commands."""
-    log = make_log()
-    tau = 10 * np.cos(log.t[:, None] * [2.0, 3.0])
-    return replace(log, tau=tau, q_ref=None, v_ref=None, tau_ref=None, has_torque=True, **changes)
+    log = sine_log()
+    commands = {"q_ref": log.q + 0.1, "v_ref": 0.9 * log.v, "tau_ref": log.tau}
+    return replace(log, **({"tau": 0 * log.tau, "has_torque": False} | commands | changes))
 
 
 def assert_same(back, log):
@@ -68,7 +57,7 @@ def assert_same(back, log):
 
 
 def test_the_clock_is_the_header_unless_stated(tmp_path):
-    log = measured()
+    log = sine_log()
     path = write_mcap(tmp_path / "run.mcap", messages_of(log), delay=lambda _: 0.25)
     assert_same(read_log(path, JOINTS), log)
     back = read_log(path, JOINTS, source=LogSource(stamp="log"))
@@ -76,7 +65,7 @@ def test_the_clock_is_the_header_unless_stated(tmp_path):
 
 
 def test_the_topic_must_be_stated_if_several_would_do(tmp_path):
-    log = measured()
+    log = sine_log()
     topics = {"/arm": messages_of(log), "/ghost": messages_of(replace(log, q=log.q + 1))}
     path = write_bag2(tmp_path / "bag", topics, others=["/chatter"])
     listing = (
@@ -106,7 +95,7 @@ def test_a_bag_without_joint_states_lists_what_it_holds(tmp_path):
 
 
 def test_other_messages_are_passed_over_and_values_are_checked_as_in_any_log(tmp_path):
-    log = measured()
+    log = sine_log()
     finger = [(t + 0.003, ["finger"], [0.5], [], []) for t in log.t]
     messages = sorted([*messages_of(log), *finger], key=lambda message: message[0])
     back = read_log(write_mcap(tmp_path / "run.mcap", messages), JOINTS)

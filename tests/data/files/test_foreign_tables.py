@@ -11,7 +11,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 from helpers.recorders import write_lerobot
-from helpers.synthetic import exact_log, truth
+from helpers.synthetic import exact_log, sine_log, truth
 
 import robotid
 from robotid.base.exceptions import DataError, ModelError, SettingsError
@@ -26,10 +26,7 @@ from robotid.robot.examples import example_urdf
 
 JOINTS = ("shoulder", "elbow")
 T = np.arange(60) / 50
-PHASE = T[:, None] * [2.0, 3.0]
-LOG = Log(
-    t=T, q=np.sin(PHASE), v=np.cos(PHASE) * [2.0, 3.0], tau=10 * np.cos(PHASE), joints=JOINTS
-)  # fmt: skip
+LOG = sine_log(t=T)
 WORDS = {"position": LOG.q, "velocity": LOG.v, "effort": LOG.tau}
 
 

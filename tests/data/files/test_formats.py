@@ -25,6 +25,7 @@ from helpers.recorders import (
     write_mat73,
     write_mcap,
 )
+from helpers.synthetic import sine_log
 
 from robotid.base.exceptions import DataError, MissingDependencyError
 from robotid.cli.convert import convert
@@ -39,16 +40,6 @@ from robotid.data.signal_settings import LogSource, LogUnits
 JOINTS = ("shoulder", "elbow")
 HOW = "(job file table [log], CLI --topic, Python source=LogSource(topic=...))"
 WRITTEN = [".csv", ".parquet", ".npz", ".h5", ".hdf5", ".mat"]
-
-
-def make_log(count=60, **changes):
-    t = 1000.0 + np.arange(count) / 50
-    phase = t[:, None] * [2.0, 3.0]
-    fields = {
-        "t": t, "q": np.sin(phase), "v": np.cos(phase) * [2.0, 3.0], "tau": 10 * np.cos(phase),
-        "joints": JOINTS,
-    }  # fmt: skip
-    return Log(**(fields | changes))
 
 
 def assert_same(back, log, names=("t", "q", "v", "tau")):
@@ -110,7 +101,7 @@ def recorded(name, folder, log):
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_what_a_library_wrote_is_read_unchanged(tmp_path, name):
-    log = make_log()
+    log = sine_log()
     path = recorded(name, tmp_path, log)
     back = read_log(path, JOINTS)
     assert_same(back, log)
@@ -147,7 +138,7 @@ def test_written_logs_are_read_back_to_the_last_bit(tmp_path, rng, suffix, has_t
 
 def test_writing_replaces_a_file_at_once_or_not_at_all(tmp_path, monkeypatch):
     path = tmp_path / "run.csv"
-    write_log(make_log(), path)
+    write_log(sine_log(), path)
     before = path.read_bytes()
 
     def fail(*_):
@@ -155,10 +146,10 @@ def test_writing_replaces_a_file_at_once_or_not_at_all(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "replace", fail)
     with pytest.raises(OSError, match="disk full"):
-        write_log(make_log(v=None), path)
+        write_log(sine_log(v=None), path)
     assert path.read_bytes() == before
     with pytest.raises(DataError, match="'q_joint-1' is not a valid name of a MATLAB variable"):
-        write_log(make_log(joints=("joint-1", "elbow")), tmp_path / "run.mat")
+        write_log(sine_log(joints=("joint-1", "elbow")), tmp_path / "run.mat")
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -174,8 +165,8 @@ def test_suffixes_of_formats_are_known_in_any_case(tmp_path):
         with refused(
             f"{name}: logs are written as {', '.join(WRITTEN[:-1])} or .mat files, not {suffix!r}"
         ):
-            write_log(make_log(), tmp_path / name)
-    write_log(make_log(), tmp_path / "run.csv")
+            write_log(sine_log(), tmp_path / name)
+    write_log(sine_log(), tmp_path / "run.csv")
     path = (tmp_path / "run.csv").rename(tmp_path / "RUN.CSV")
     assert len(read_log(path, JOINTS).t) == 60
 
@@ -194,7 +185,7 @@ def test_without_its_library_a_format_says_how_to_install_it(
     tmp_path, monkeypatch, name, module, purpose, package, extra
 ):
     path = tmp_path / f"run{name}"
-    path = recorded(name, tmp_path, make_log()) if name in FORMATS else path
+    path = recorded(name, tmp_path, sine_log()) if name in FORMATS else path
     path.touch()
     monkeypatch.setitem(sys.modules, module, None)
     words = rf"^{purpose} needs {package}, which is not installed: pip install '.\[{extra}\]'"
@@ -202,7 +193,7 @@ def test_without_its_library_a_format_says_how_to_install_it(
         read_log(path, JOINTS)
     if extra != "bag":
         with pytest.raises(MissingDependencyError, match=f"^writing .* needs {package}"):
-            write_log(make_log(), tmp_path / ("out.h5" if extra == "hdf5" else "out.parquet"))
+            write_log(sine_log(), tmp_path / ("out.h5" if extra == "hdf5" else "out.parquet"))
 
 
 # --- rows of long files ---------------------------------------------------------------------------
@@ -413,7 +404,7 @@ def test_rows_are_written_in_groups_of_a_fixed_size(tmp_path, monkeypatch):
 
 
 def test_groups_are_chosen_like_topics(tmp_path):
-    log = make_log()
+    log = sine_log()
     path = tmp_path / "run.h5"
     with h5py.File(path, "w") as file:
         for group, arrays in (("left", wide(log, object)), ("right", {"time": log.t})):
@@ -429,7 +420,7 @@ def test_groups_are_chosen_like_topics(tmp_path):
 
 
 def test_arrays_are_numbered_or_named_by_texts(tmp_path):
-    log = make_log()
+    log = sine_log()
     path = tmp_path / "run.npz"
     np.savez(path, time=log.t, q=log.q, tau=log.tau, mass=3.0, image=np.zeros((60, 2, 2)))
     by_order = read_log(path, JOINTS)
@@ -459,7 +450,7 @@ def test_arrays_are_numbered_or_named_by_texts(tmp_path):
     ],
 )
 def test_arrays_that_do_not_fit_are_refused(tmp_path, changes, fragment):
-    arrays = {name: x for name, x in (wide(make_log()) | changes).items() if x is not None}
+    arrays = {name: x for name, x in (wide(sine_log()) | changes).items() if x is not None}
     np.savez(tmp_path / "run.npz", **arrays)
     with pytest.raises(DataError, match=re.escape(fragment)):
         read_log(tmp_path / "run.npz", JOINTS)
@@ -570,7 +561,7 @@ def test_arrays_of_another_width_are_refused(flight, tmp_path):
 @pytest.mark.parametrize("name", ["mcap", "db3", "ros1", "npz", "hdf5", "mat struct", "mat 7.3"])
 @pytest.mark.parametrize("left", [0.0, 0.5, 0.9])
 def test_files_that_were_cut_are_refused_by_name(tmp_path, name, left):
-    path = recorded(name, tmp_path, make_log(2000))
+    path = recorded(name, tmp_path, sine_log(2000))
     content = path.read_bytes()
     path.write_bytes(content[: int(len(content) * left)])
     with pytest.raises(DataError, match=rf"^{path.name}: broken,? .*"):

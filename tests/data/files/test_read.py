@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from helpers.recorders import wide
+from helpers.synthetic import sine_log
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.data.base_motion import BaseColumns
@@ -24,10 +25,7 @@ from robotid.robot.tree import Joint
 JOINTS = ("shoulder", "elbow")
 T = 1000.0 + np.arange(300) / 100
 PHASE = T[:, None] * [2.0, 3.0]
-LOG = Log(
-    t=T, q=np.sin(PHASE), v=np.cos(PHASE) * [2.0, 3.0], a=-np.sin(PHASE) * [4.0, 9.0],
-    tau=10 * np.cos(PHASE), joints=JOINTS,
-)  # fmt: skip
+LOG = sine_log(300, 100, a=-np.sin(PHASE) * [4.0, 9.0])
 ONE = np.ones(300)
 #: Changes of a table that leave out the columns of a quantity.
 NO_Q, NO_TAU = ({f"{kind}_{joint}": None for joint in JOINTS} for kind in ("q", "tau"))

@@ -63,13 +63,13 @@ def test_signs_of_quaternions_have_no_effect(robot, log):
     assert np.abs(flipped.base.pose - log.base.pose).max() < 1e-15
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda q: np.roll(q, 1, axis=1), "its order is qw qx qy qz"),
-        (lambda q: q * [-1.0, -1.0, -1.0, 1.0], "it is the orientation of the world in the base"),
-    ],
-)
+QUATERNIONS = [
+    (lambda q: np.roll(q, 1, axis=1), "its order is qw qx qy qz"),
+    (lambda q: q * [-1.0, -1.0, -1.0, 1.0], "it is the orientation of the world in the base"),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), QUATERNIONS)
 def test_another_order_of_the_quaternion_is_named(robot, log, change, words):
     (found,) = check_base(robot, with_quaternion(log, change), SLOW)
     assert (found.code, found.severity) == ("base_orientation", "error")
@@ -340,13 +340,7 @@ def test_the_mean_specific_force_in_the_world_is_stated_for_a_robot_that_drives_
 
 
 @pytest.mark.parametrize("has_contacts", [True, False])
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda q: np.roll(q, 1, axis=1), "its order is qw qx qy qz: state"),
-        (lambda q: q * [-1.0, -1.0, -1.0, 1.0], "it is the orientation of the world in the base"),
-    ],
-)
+@pytest.mark.parametrize(("change", "words"), QUATERNIONS)
 def test_another_quaternion_is_named_without_a_position(robot, sway, change, words, has_contacts):
     """By the feet relative to each other, or by the gyroscopes."""
     log = without_position(sway)

@@ -1,8 +1,6 @@
 """The doctor finds what is wrong with commands, and nothing where nothing is."""
 
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -20,9 +18,6 @@ from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
 GOOD = (Servo(), Servo(coulomb=2.0, delay=0.03))
-FOLDERS = (os.environ.get("ROBOTID_DATA"), Path(__file__).resolve().parents[4] / "shared" / "data")
-DATA = next((Path(folder) for folder in FOLDERS if folder and Path(folder).is_dir()), Path("none"))
-real = pytest.mark.usefixtures("recordings")  # which skips, or fails in CI, if there are none
 
 
 @pytest.fixture(scope="module")
@@ -223,10 +218,9 @@ RECORDED = {
 }
 
 
-@real
 @pytest.mark.parametrize("name", RECORDED)
-def test_recordings_show_what_is_wrong_with_them(name):
-    path = DATA / "commands" / f"{name}.parquet"
+def test_recordings_show_what_is_wrong_with_them(recordings, name):
+    path = recordings / "commands" / f"{name}.parquet"
     joints = [x[2:] for x in pq.read_schema(path).names if x.startswith("q_")]
     log = read_log(path, joints, needs="commands")
     loud = {f.code: f for f in check_commands(log) if f.severity != "note"}
@@ -257,11 +251,10 @@ def test_sizes_of_loads_taken_for_torques_are_an_error(ur5, of_ur5):
     assert {"unsigned_torque"} <= {f.code for f in findings if f.severity == "error"}
 
 
-@real
-def test_loads_of_a_servo_arm_mapped_to_torques_are_an_error():
+def test_loads_of_a_servo_arm_mapped_to_torques_are_an_error(recordings):
     model = RobotModel.from_urdf(example_urdf("so101.urdf"))
     names = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
-    path = DATA / "commands" / "so101" / "multisine.parquet"
+    path = recordings / "commands" / "so101" / "multisine.parquet"
     source = LogSource(joints=dict(zip(model.joints, names, strict=True)))
     with pytest.raises(DataError, match=r"no columns 'tau_Rotation'.*\. The log has commanded"):
         read_log(path, model.joints, source=source)

@@ -108,15 +108,9 @@ def test_the_radius_of_a_rolling_foot_is_found(robot, ball):
 @pytest.mark.parametrize("part", [slice(0, 3), slice(3, 6)])
 def test_a_twist_with_the_axes_of_the_world_is_found(robot, walk, part):
     t = walk.t
-    pose = np.array(
-        [
-            pin.SE3ToXYZQUAT(
-                pin.SE3(pin.rpy.rpyToMatrix(0.8, -0.5, 1.5 + 0.3 * np.sin(3 * x)),
-                        np.array([np.sin(x), np.cos(2 * x), 0.0]))
-            )
-            for x in t
-        ]
-    )  # fmt: skip
+    R = [pin.rpy.rpyToMatrix(0.8, -0.5, 1.5 + 0.3 * np.sin(3 * x)) for x in t]
+    p = np.column_stack([np.sin(t), np.cos(2 * t), 0.0 * t])
+    pose = np.array([pin.SE3ToXYZQUAT(pin.SE3(*x)) for x in zip(R, p, strict=True)])
     twist = base_state(t, pose, None, None)[1]
     right = replace(walk, base=BaseMotion(pose, twist), contacts={})
     free = replace(robot, constraints=())

@@ -373,14 +373,10 @@ def test_a_wide_range_is_a_bound_and_a_narrow_one_widens_the_interval(crane):
 @pytest.mark.parametrize(
     ("ratio", "half_width", "verifies", "contradicts"),
     [
-        (1.049, 0.049, True, False),
-        (1.049, 0.051, False, False),
-        (1.051, 0.049, False, False),
-        (0.9, 0.049, False, True),
-        (0.9, 0.051, False, False),
-        (None, 0.0, False, False),
+        (1.049, 0.049, True, False), (1.049, 0.051, False, False), (1.051, 0.049, False, False),
+        (0.9, 0.049, False, True), (0.9, 0.051, False, False), (None, 0.0, False, False),
     ],
-)
+)  # fmt: skip
 def test_each_limit_of_a_stated_mass(ratio, half_width, verifies, contradicts):
     stated = StatedMass(("total_mass",), ratio, half_width)
     assert (stated.verifies, stated.contradicts) == (verifies, contradicts)

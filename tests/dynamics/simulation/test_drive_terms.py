@@ -13,39 +13,25 @@ from robotid.dynamics.simulation.loop_lanes import (
 )
 from robotid.dynamics.simulation.simulator import RobotPlant
 from robotid.dynamics.torque import joint_torque_regressor
+from robotid.robot import drives
 from robotid.robot.drive_term import LOADED, DriveTerm, MemorylessTerm
-from robotid.robot.drives import (
-    TERMS,
-    Armature,
-    Asymmetric,
-    Bristles,
-    Counterbalance,
-    Cubic,
-    Harmonic,
-    Hat,
-    Lag,
-    LoadFriction,
-    LuGre,
-    PositionCoulomb,
-    Power,
-    Presliding,
-    Ramp,
-    Spring,
-    Stribeck,
-    Tanh,
-)
 from robotid.robot.model import RobotModel
 
 OWN = (
-    Asymmetric(), LoadFriction(), Cubic(data_range=(0.0, 1.5)),
-    Stribeck(speed=0.3, data_range=(0.2, 1.5)), Tanh(speed=0.4, data_range=(0.0, 1.5)),
-    Power(exponent=0.4), Ramp(low=0.1, high=0.9),
-    Harmonic(order=2.0), Harmonic(order=3.0, is_sine=True), PositionCoulomb(order=0),
-    PositionCoulomb(order=2, centre=0.3, data_range=(-0.6, 0.9)), Spring(data_range=(-0.6, 0.9)),
-    Hat(at=0.4, before=-0.3, after=0.9), Counterbalance(arm=0.2, base=0.6, angle=0.4, rest=0.3),
+    drives.Asymmetric(), drives.LoadFriction(), drives.Cubic(data_range=(0.0, 1.5)),
+    drives.Stribeck(speed=0.3, data_range=(0.2, 1.5)), drives.Power(exponent=0.4),
+    drives.Tanh(speed=0.4, data_range=(0.0, 1.5)), drives.Ramp(low=0.1, high=0.9),
+    drives.Harmonic(order=2.0), drives.Harmonic(order=3.0, is_sine=True),
+    drives.PositionCoulomb(order=0), drives.Spring(data_range=(-0.6, 0.9)),
+    drives.PositionCoulomb(order=2, centre=0.3, data_range=(-0.6, 0.9)),
+    drives.Hat(at=0.4, before=-0.3, after=0.9),
+    drives.Counterbalance(arm=0.2, base=0.6, angle=0.4, rest=0.3),
 )  # fmt: skip
-MEMORYLESS = (*(t for t in TERMS.values() if not t.is_inertia), *OWN)
-LASTING = (Presliding(displacement=0.05), LuGre(displacement=0.05, speed=0.3, excess=0.6))
+MEMORYLESS = (*(t for t in drives.TERMS.values() if not t.is_inertia), *OWN)
+LASTING = (
+    drives.Presliding(displacement=0.05),
+    drives.LuGre(displacement=0.05, speed=0.3, excess=0.6),
+)
 #: Positions and speeds of two joints: of either sign, off the centre, within ranges and beyond.
 STATES = [
     ((0.43, -0.27), (0.7, -0.35)), ((-0.51, 0.77), (-1.2, 0.05)), ((0.81, -1.1), (2.2, -1.9)),
@@ -60,7 +46,7 @@ def registered(kind=DriveTerm):
 
 def with_term(own):
     """Return the planar arm, whose joints have one term of these sizes, and its parameters."""
-    is_plain = own.name in TERMS
+    is_plain = own.name in drives.TERMS
     model = RobotModel.from_urdf(
         URDF / "planar_2r.urdf", terms=(own.name,) if is_plain else (),
         own_terms={} if is_plain else dict.fromkeys(("joint_1", "joint_2"), (own,)),
@@ -78,7 +64,7 @@ def compiled_term(own, q, v):
 def test_every_registered_term_is_walked_over():
     walked = {type(own) for own in (*MEMORYLESS, *LASTING)}
     own = {kind for kind in registered() if kind.__module__.startswith("robotid.")}
-    assert own - walked == {MemorylessTerm, Bristles, Armature, Lag}
+    assert own - walked == {MemorylessTerm, drives.Bristles, drives.Armature, drives.Lag}
 
 
 @pytest.mark.parametrize("own", MEMORYLESS, ids=lambda own: own.name)
@@ -106,7 +92,7 @@ def test_regressor_plant_and_roll_out_have_one_torque(own, q, v):
 def test_the_slopes_of_a_compiled_term_are_those_of_differences(own, q, v):
     _, by_speed, by_position = compiled_term(own, q, v)
     h = 1e-9 if abs(v) < 1e-5 else H  # friction turns over 1e-5 rad/s
-    if not (v == 0.0 and isinstance(own, Asymmetric | Power)):  # they bend there
+    if not (v == 0.0 and isinstance(own, drives.Asymmetric | drives.Power)):  # they bend there
         slope = (compiled_term(own, q, v + h)[0] - compiled_term(own, q, v - h)[0]) / (2 * h)
         np.testing.assert_allclose(by_speed, slope, rtol=1e-5, atol=1e-7)
     slope = (compiled_term(own, q + H, v)[0] - compiled_term(own, q - H, v)[0]) / (2 * H)

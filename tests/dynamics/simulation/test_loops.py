@@ -100,10 +100,8 @@ def commanded(model, duration=0.4, reach=0.3, seed=0, t=None):
     q_ref = reach * np.sin(w * t[:, None] + phase)
     v_ref = 0.3 * reach * w * np.cos(w * t[:, None] + phase)
     q = np.tile(q_ref[0] + 0.05, (len(t), 1))
-    tau = np.zeros_like(q)
-    return Log(
-        t, q, tau, model.joints, q_ref=q_ref, v_ref=v_ref, tau_ref=0.2 * v_ref, has_torque=False
-    )
+    commands = {"q_ref": q_ref, "v_ref": v_ref, "tau_ref": 0.2 * v_ref}
+    return Log(t, q, 0 * q, model.joints, has_torque=False, **commands)
 
 
 def rolled(model, loops, log, step=2e-3):
@@ -356,9 +354,8 @@ def test_a_held_loop_has_the_closed_form_of_its_ticks(tmp_path, rate, begin):
     np.testing.assert_allclose(out.q[:, 0], exact, atol=1e-12)
     assert abs(exact[-1] - 0.3) < 0.07 < abs(exact[10] - 0.3), "it follows"
     damped = held_slider(t, (0.1, -0.4), 0.3, rate, begin, **(body | {"mass": 2.5}), viscous=20.0)
-    [out] = ClosedLoopRobot(model, step=2e-4).roll_out(
-        replace(rail, values=np.array([20.0])), [window]
-    )
+    rough = replace(rail, values=np.array([20.0]))
+    [out] = ClosedLoopRobot(model, step=2e-4).roll_out(rough, [window])
     np.testing.assert_allclose(out.q[:, 0], damped, atol=1e-7)
     [free] = ClosedLoopRobot(model).roll_out(replace(rail, rate=None), [window])
     assert np.abs(free.q[:, 0] - exact).max() > 3e-4
@@ -374,10 +371,8 @@ def test_a_controller_too_slow_for_its_gains_is_told_the_rate_it_needs(tmp_path)
     stiff = rail | {"kp": 3e4, "kd": np.array([100.0])}  # 3e4 / (2 100)
     with pytest.raises(NotConvergedError, match=r"kp 3e\+04 and kd 100 need about 150 Hz"):
         rolled(model, loops_of(model, (Viscous(),), zero=np.zeros(1), rate=40.0, **stiff), log)
-    with pytest.raises(
-        NotConvergedError,
-        match=r"simulation of j is unstable: .* rate of 40 Hz is too low.*kd 400 need about 80 Hz",
-    ):
+    words = r"simulation of j is unstable: .* rate of 40 Hz is too low.*kd 400 need about 80 Hz"
+    with pytest.raises(NotConvergedError, match=words):
         rolled(model, loops_of(model, (Viscous(),), zero=np.zeros(1), rate=40.0, **rail), log)
     settled = rolled(model, loops_of(model, (Viscous(),), zero=np.zeros(1), rate=85.0, **rail), log)
     assert np.abs(settled.q).max() < 0.5
@@ -450,21 +445,14 @@ def test_lanes_know_nothing_of_each_other(legs):
             np.testing.assert_allclose(mine[2], other[2], atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"free_flyer": True},
-        {"couplings": (Coupling("motor", (("wrist_2_joint", 1.0), ("wrist_3_joint", -0.5))),)},
-    ],
-)
-def test_robots_that_cannot_be_rolled_out_are_named(options):
-    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), **options)
-    words = r"base floats; the estimator 'simulation'|cannot be simulated. Leave out \[\[coupling"
-    with pytest.raises((DataError, SettingsError), match=words):
-        ClosedLoopRobot(model)
-
-
-def test_a_late_torque_has_no_place_and_is_told_why(planar):
+def test_robots_and_terms_that_cannot_be_rolled_out_are_named(planar):
+    motor = Coupling("motor", (("wrist_2_joint", 1.0), ("wrist_3_joint", -0.5)))
+    for options, kind, words in (
+        ({"free_flyer": True}, DataError, "base floats; the estimator 'simulation'"),
+        ({"couplings": (motor,)}, SettingsError, r"cannot be simulated. Leave out \[\[coupling"),
+    ):
+        with pytest.raises(kind, match=words):
+            ClosedLoopRobot(RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), **options))
     loops = loops_of(planar, (*PLAIN, Lag()), (0.1, 0.1, 0.0, 0.01))
     words = r"the term Lag is not possible in a closed-loop simulation: it delays.*set delay in"
     with pytest.raises(SettingsError, match=words):
@@ -476,10 +464,8 @@ def test_a_late_torque_has_no_place_and_is_told_why(planar):
     [
         (Coulomb(), -5.0, r"simulation of FL_hip_joint .*joint.coulomb is -5, wanted 0 or more"),
         (LoadFriction(), 1.4, r"FL_hip_joint.load is 1.4, wanted at most 0.5. Set other friction"),
-        (
-            PositionCoulomb(order=1, centre=0.9), 3.0,
-            r"FL_hip_joint .* its Coulomb friction is -3.11 N m at -0.136 rad, wanted 0 or more",
-        ),
+        (PositionCoulomb(order=1, centre=0.9), 3.0,
+         r"FL_hip_joint .* its Coulomb friction is -3.11 N m at -0.136 rad, wanted 0 or more"),
     ],
 )  # fmt: skip
 def test_friction_without_a_solution_is_named_with_joint_value_and_time(legs, term, value, words):
@@ -519,8 +505,7 @@ def test_ticks_between_rows_take_the_commands_of_their_own_half_row(planar):
     """Two ticks a row, a quarter of a row late: beside a log that has a row for each tick."""
     log = commanded(planar, 0.2)
     loops = loops_of(planar, kp=60.0, rate=2 * RATE, delay=np.full(2, 0.25 / RATE))
-    [late] = ClosedLoopRobot(planar, step=1e-3).roll_out(loops, cut_windows(log, np.inf, 0.0))
-    N = len(log.t)
+    late, N = rolled(planar, loops, log, step=1e-3), len(log.t)
 
     def told(x):  # of a tick at a row, the half row about it; of one between rows, the last row
         before = np.vstack([x[:1], x[:-1]])
@@ -529,7 +514,5 @@ def test_ticks_between_rows_take_the_commands_of_their_own_half_row(planar):
     names = {name: told(getattr(log, name)) for name in ("q_ref", "v_ref", "tau_ref")}
     q = np.tile(log.q[:1], (2 * N - 1, 1))
     fine = Log(np.arange(2 * N - 1) / (2 * RATE), q, 0 * q, log.joints, has_torque=False, **names)
-    [same] = ClosedLoopRobot(planar, step=1e-3).roll_out(
-        replace(loops, delay=np.zeros(2)), cut_windows(fine, np.inf, 0.0)
-    )
+    same = rolled(planar, replace(loops, delay=np.zeros(2)), fine, step=1e-3)
     np.testing.assert_allclose(late.q, same.q[::2], atol=1e-12)

@@ -9,13 +9,9 @@ from helpers.estimation import ESTIMATORS, NOISE, Case, RandomStates
 from robotid.base.exceptions import DataError
 from robotid.dynamics.factors import compress
 from robotid.estimation.estimators import (
-    OLS,
     RLS,
-    TLS,
-    WLS,
     Estimate,
     Kalman,
-    NormalisedGradient,
     fold,
 )
 from robotid.robot.examples import example_urdf
@@ -128,11 +124,8 @@ ESTIMATE = Estimate(
 )
 
 
-def test_each_parameter_has_its_own_error():
+def test_each_parameter_has_its_own_error_and_students_quantile():
     np.testing.assert_array_equal(ESTIMATE.std_error, ERROR)
-
-
-def test_intervals_reach_students_quantile():
     np.testing.assert_allclose(ESTIMATE.quantile, 1.959964, rtol=1e-6)
     few = replace(ESTIMATE, details={"freedom": np.array([12.0, 4.0, np.inf])})
     np.testing.assert_allclose(few.quantile, [2.178813, 2.776445, 1.959964], rtol=1e-6)
@@ -150,17 +143,7 @@ def test_text_states_value_and_error_of_each_parameter():
     assert repr(ESTIMATE) == f"<{head}>"
 
 
-@pytest.mark.parametrize(
-    ("estimator", "weighing"),
-    [
-        (OLS(), "alike"),
-        (WLS(), "by joint"),
-        (TLS(), "by joint"),
-        (RLS(np.ones(2)), "by joint"),
-        (RLS(np.ones(2), 0.9, np.zeros(3), np.ones(3)), "by age"),
-        (Kalman(np.ones(2), np.zeros(3), np.ones(3)), "by age"),
-        (NormalisedGradient(np.ones(2)), "by step"),
-    ],
-)
-def test_an_estimator_says_how_its_rows_weigh(estimator, weighing):
-    assert estimator.weighing == weighing
+def test_rows_of_a_filter_that_forgets_or_gates_weigh_by_age():
+    prior = np.zeros(3), np.ones(3)
+    assert Kalman(np.ones(2), *prior).weighing == RLS(np.ones(2), 0.9, *prior).weighing == "by age"
+    assert RLS(np.ones(2)).weighing == "by joint"

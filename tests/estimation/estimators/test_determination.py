@@ -2,13 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers.fitting import identify
-from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import RankDeficientError
-from robotid.data.log import Log
-from robotid.data.signal_settings import SignalSettings
-from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.estimators.determination import (
     Combination,
     Determination,
@@ -16,35 +11,6 @@ from robotid.estimation.estimators.determination import (
     base_spread,
     determine,
 )
-from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-
-EXACT = SignalSettings(cutoff=None, trim=0.0)
-NOISE = 0.1  # [N m]
-CHOICE = EstimatorSettings()  # intervals are not read
-
-
-def moved(model, change, *, samples=600, noise=NOISE):
-    """Return a log of a motion that was changed, with its own torques and noise."""
-    rng = np.random.default_rng(1)
-    log = exact_log(model, truth(model), rng, samples=samples)
-    q, v, a = (np.array(x) for x in (log.q, log.v, log.a))
-    change(log.t, q, v, a)
-    tau = (joint_torque_regressor(model, q, v, a) @ truth(model)).reshape(q.shape)
-    tau += noise * rng.standard_normal(q.shape)
-    return Log(t=log.t, q=q, v=v, a=a, tau=tau, joints=log.joints)
-
-
-def pan_one_way(t, q, v, a):
-    """The first joint turns one way only, now faster, now slower."""
-    q[:, 0], v[:, 0], a[:, 0] = 0.5 * t - 0.3 * np.cos(t), 0.5 + 0.3 * np.sin(t), 0.3 * np.cos(t)
-
-
-@pytest.fixture(scope="module")
-def pan(ur5):
-    return identify(ur5, [moved(ur5, pan_one_way)], signals=EXACT, estimator=CHOICE)
-
-
-ONE = np.ones(3)
 
 
 def test_words_name_the_four_largest_terms_of_a_sum_by_their_shares():
@@ -141,19 +107,3 @@ def test_named_sums_hold_along_every_direction_the_data_leave_open(seed):
     # as many independent sums and single ones as the rank
     sums = sum(len(group.combinations) for group in known.groups)
     assert sums + len(alone) == known.rank
-
-
-def test_a_joint_that_turns_one_way_leaves_friction_and_offset_a_sum(pan):
-    known = pan.determination
-    assert known.undetermined == ("shoulder_pan_joint.coulomb", "shoulder_pan_joint.offset")
-    assert known.rank == 57
-    assert known.described() == (
-        "shoulder_pan_joint.coulomb and shoulder_pan_joint.offset are identifiable only as "
-        "shoulder_pan_joint.coulomb + shoulder_pan_joint.offset"
-    )
-    # the sum is found, the terms are not
-    pi = truth(pan.model)
-    at = [pan.model.layout.names.index(f"shoulder_pan_joint.{x}") for x in ("coulomb", "offset")]
-    assert pan.standard[at].sum() == pytest.approx(pi[at].sum(), abs=0.15)
-    of_sum = np.sqrt(pan.standard_covariance[np.ix_(at, at)].sum())
-    assert pan.standard_error[at].min() > 10.0 * of_sum

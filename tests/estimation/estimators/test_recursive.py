@@ -21,29 +21,6 @@ def test_rls_with_the_noise_levels_of_wls_is_wls(ur5, rng):
     np.testing.assert_allclose(ours.sigma, wls.sigma, rtol=0.01)
 
 
-def test_forgetting_does_not_wind_up_where_nothing_moves():
-    # one sample over and over: with forgetting 0.8 the rest would be forgotten after ten
-    rng, c = np.random.default_rng(0), 12
-    prior, std = np.arange(1.0, c + 1), np.full(c, 2.0)
-    estimator = RLS(np.full(2, 0.1), 0.8, prior, std)
-    state = estimator.init(c)
-    Y = np.zeros((2, c))
-    Y[:, :2] = [[1.0, 0.5], [0.0, 1.0]]
-    truth = np.array([3.0, -1.0])
-    for _ in range(7_000):  # 0.8^(n / 2) is below the smallest double
-        tau = Y[:, :2] @ truth + 1e-3 * rng.standard_normal(2)
-        state = estimator.update(state, Sample(Y, tau, np.ones(2)))
-    assert np.isfinite(state.R).all()
-    smallest = np.linalg.svd(state.R[:c, :c], compute_uv=False)[-1]
-    assert smallest > 0.5 * 0.8 ** (c / 2) / 2.0  # the floor, forgetting^(c/2) / prior_std
-    estimate = estimator.estimate(state, tuple("abcdefghijkl"))
-    np.testing.assert_allclose(estimate.theta[:2], truth, atol=0.05)
-    np.testing.assert_allclose(estimate.theta[2:], prior[2:], atol=1e-9)
-    # and the first jump that comes is taken calmly
-    jump = estimator.update(state, Sample(np.ones((2, c)), np.full(2, prior.sum()), np.ones(2)))
-    assert np.abs(estimator.estimate(jump, tuple("abcdefghijkl")).theta).max() < 50
-
-
 def test_what_rls_was_not_shown_is_refused_by_name_or_keeps_its_prior():
     rng, names = np.random.default_rng(0), ("a", "b", "c")
     W = rng.standard_normal((40, 3))

@@ -15,6 +15,7 @@ from robotid.estimation.fitting.evaluation import (
     shares_rows,
 )
 from robotid.estimation.fitting.recorded import hold_log
+from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
@@ -34,9 +35,8 @@ def test_baselines_are_the_urdf_with_and_without_motion(ur5, rng):
     np.testing.assert_allclose(found.torques["truth"], recording.trajectory.tau, atol=1e-10)
     (urdf,) = predict(ur5, [prior], recording.trajectory)
     np.testing.assert_allclose(found.torques["urdf"], urdf, rtol=1e-12, atol=1e-12)
-    assert (
-        np.abs(found.torques["gravity_only"][:, 0]).max() < 1e-9
-    )  # a vertical axis carries no weight
+    # a vertical axis carries no weight
+    assert np.abs(found.torques["gravity_only"][:, 0]).max() < 1e-9
     measured = found.metrics["truth"].per_joint["elbow_joint"]
     assert measured.relative_error_pct < 1e-9
     assert measured.baselines["gravity_only"] > 10
@@ -83,8 +83,6 @@ def test_joints_are_hidden_whose_torque_changes_less_over_the_rows_used_than_is_
 
 
 def test_rows_of_slow_joints_and_slow_coupled_drives_are_left_out(ur5, rng):
-    from robotid.robot.model import RobotModel
-
     coupling = Coupling("motor", (("wrist_2_joint", 1.0), ("wrist_3_joint", 1.0)))
     coupled = RobotModel.from_urdf(ur5.tree.path, couplings=(coupling,))
     trajectory = hold_log(ur5, exact_log(ur5, truth(ur5), rng), EXACT).whole.trajectory

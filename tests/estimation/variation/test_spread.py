@@ -207,8 +207,6 @@ def test_draws_are_those_of_a_normal_distribution_given_that_they_are_possible()
     assert np.cov(drawn.T) == pytest.approx(np.cov(wanted.T), abs=0.03)
     for p in range(2):
         assert scipy.stats.ks_2samp(drawn[:, p], wanted[:, p]).pvalue > 1e-3
-    again = possible_draws(L, is_possible, 50, np.random.default_rng(1))
-    assert again.tolist() == possible_draws(L, is_possible, 50, np.random.default_rng(1)).tolist()
 
 
 def test_values_at_scores_are_quantiles_given_the_smallest_value():

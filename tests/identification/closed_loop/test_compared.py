@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from helpers.mujoco_plant import plant, recorded
 
-from robotid.base.exceptions import DataError
+from robotid.base.exceptions import DataError, SettingsError
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.identification.closed_loop.from_commands import identify_loops, loop_findings
-from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.closed_loop.loop_settings import LoopSettings, groups_of
 from robotid.identification.closed_loop.stages import fit_loops
 
 KP, KD, DELAY, TORQUE = 80.0, 3.0, 0.0053, 0.05
@@ -103,3 +103,32 @@ def test_torques_that_are_not_of_the_loop_are_named():
     unequal = replace(swapped, fit=replace(swapped.fit, estimate=estimate))
     [finding] = [f for f in loop_findings(unequal, ()) if f.code == "unequal_gains"]
     assert (finding.where, finding.evidence) == ("joint_1, joint_2", {"lowest": 15, "highest": 60})
+
+
+JOINTS = ("FL_hip_joint", "FL_calf_joint", "FR_hip_joint", "FR_calf_joint", "tail")
+
+
+def test_joints_that_are_alike_share_a_group_named_by_their_words():
+    found = groups_of(LoopSettings(), JOINTS, ["a", "b", "a", "b", "c"])
+    assert found == ["hip", "calf", "hip", "calf", "tail"]
+    legs = ("front_left_knee", "front_right_knee", "rear_left_knee")  # words of some are not theirs
+    assert groups_of(LoopSettings(), legs, "kkk") == ["knee", "knee", "knee"]
+
+
+def test_a_joint_of_two_groups_is_refused():
+    loop = LoopSettings(groups={"front": ["tail"], "back": ["tail"]})
+    with pytest.raises(SettingsError, match=r"joint 'tail' is in the groups front and back"):
+        groups_of(loop, JOINTS, [1] * 5)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("kp", 20.0), ("kd", {"tail": 1.0}), ("limit", "find"), ("delay", 0.01),
+        ("gravity_compensation", True), ("zeros", "find"),
+    ],
+)  # fmt: skip
+def test_a_logged_torque_closes_no_loop(name, value):
+    with pytest.raises(SettingsError, match=rf"\[controller\] {name} is .*without a controller"):
+        LoopSettings(kind="torque", **{name: value})
+    assert LoopSettings(kind="pd", **{name: value}).kind == "pd"

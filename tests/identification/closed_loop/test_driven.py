@@ -4,7 +4,7 @@ from helpers.mujoco_plant import plant, torque_log
 
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.dynamics.simulation.loops import ClosedLoopRobot, open_loops
+from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows, open_loops
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.identification.closed_loop.from_commands import driven_log, identify_loops
 from robotid.identification.closed_loop.loop_settings import LoopSettings
@@ -74,6 +74,13 @@ def test_the_true_robot_does_under_its_torque_what_mujocos_does(arm):
     # its friction is soft over 1e-2 rad/s, ours over 1e-4
     assert (run.rmse < 3e-3).all()
     assert (run.rmse < 0.05 * run.spread).all()
+    steady = []  # each half second from the measured state
+    for w in cut_windows(log, 0.5, 0.0):
+        q, v = w.start
+        moved = log.q[w.counted] - q - np.outer(log.t[w.counted] - log.t[w.start_row], v)
+        steady.append(moved)
+    error = np.sqrt(np.mean(np.concatenate(steady) ** 2, axis=0))
+    np.testing.assert_allclose(run.baselines["steady"], error)
 
 
 def assert_drives_are_found(robot, estimate, share):

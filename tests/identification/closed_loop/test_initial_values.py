@@ -3,23 +3,31 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
+from helpers.mujoco_plant import multisine, plant, recorded
 from helpers.paths import URDF
 from helpers.single_joint import slider
 
 from robotid.data.log import Log
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows
 from robotid.dynamics.torque import predict_instants
+from robotid.estimation.fitting.estimator_settings import SimulationSettings
+from robotid.identification.closed_loop.from_commands import identify_loops
 from robotid.identification.closed_loop.initial_values import (
+    CLEAR,
     SecondOrder,
     _Motion,
+    find_encoders,
     fit_second_order,
+    parallel_axes,
     typical_sizes,
 )
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.stages import stated_loops
 from robotid.robot.drives import Coulomb, Offset, Viscous
+from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
 
@@ -102,3 +110,144 @@ def test_the_model_of_some_joints_is_that_of_another_fit(rng):
     np.testing.assert_array_equal(
         mixed.inertia_error, [one.inertia_error[0], other.inertia_error[1]]
     )
+
+
+AWAY = 0.5  # [rad] of the thigh's zero from the URDF's
+SETTINGS = SimulationSettings(window=1.0, lead=0.3, bodies=0.0, step=4e-3)
+
+
+@pytest.fixture(scope="module")
+def leg():
+    rng = np.random.default_rng(1)
+    robot = plant("leg", rng, coulomb=0.01, viscous=0.01)
+    return robot, recorded(robot, rng, duration=8.0, rate=250.0)[0]
+
+
+@pytest.fixture(scope="module")
+def moved(leg):
+    """The log of a leg whose thigh reads 0 where the URDF is at 0.5 rad."""
+    robot, log = leg
+    away = np.array([0.0, AWAY, 0.0])
+    return robot, replace(log, q=log.q - away, q_ref=log.q_ref - away)
+
+
+def test_encoders_with_the_zeros_of_the_urdf_keep_them(leg):
+    found = find_encoders(leg[0].model, [leg[1]])
+    np.testing.assert_array_equal(found.zero, 0.0)
+    np.testing.assert_array_equal(found.sign, 1.0)
+    np.testing.assert_array_equal(found.gain, 0.0)
+    assert (found.margin[:2] > CLEAR).all()
+    assert 0.0 <= found.margin[2] < CLEAR, "the calf bears little"
+    assert (found.explained[:2] > 0.3).all()
+    # ... and none where the motion is too small to tell
+    middle = leg[1].q.mean(axis=0)
+    small = replace(leg[1], q=middle + 0.2 * (leg[1].q - middle))
+    np.testing.assert_array_equal(find_encoders(leg[0].model, [small]).margin, 0.0)
+
+
+def test_a_zero_is_found_to_the_grid_and_then_by_the_fit(moved):
+    robot, log = moved
+    first = find_encoders(robot.model, [log])
+    np.testing.assert_array_equal(first.sign, 1.0)
+    assert first.zero[1] == pytest.approx(AWAY, abs=np.deg2rad(15.0))
+    assert (first.zero[[0, 2]] == 0.0).all()
+    assert first.next_zero[1] == 0.0  # that of the URDF, so gain and margin are of the same two
+    np.testing.assert_allclose(first.gain, [0.0, 1.0 - 1.0 / (1.0 + first.margin[1]), 0.0])
+    drives = robot.drives
+    loop = LoopSettings(
+        kp={d.joint: d.kp for d in drives}, kd={d.joint: d.kd for d in drives}, zeros="find"
+    )
+    found = identify_loops(robot.model, [log], [], loop, SETTINGS, chooses=False)
+    zero = dict(zip(found.fit.estimate.names, found.fit.estimate.theta, strict=True))
+    assert zero["FL_thigh_joint.zero"] == pytest.approx(AWAY, abs=0.03)
+    [said] = [f for f in found.findings if f.code == "encoder"]
+    assert said.where == "FL_thigh_joint"
+    assert said.evidence["zero"] == pytest.approx(AWAY, abs=0.03)
+    assert f"leaves {100 * said.evidence['margin']:.0f} % more" in said.message
+    assert said.evidence["next_zero"] == 0.0, "that of the URDF"
+    [kept] = [f for f in found.findings if f.code == "encoder_uncorrected"]
+    assert kept.where == "FL_hip_joint"
+    assert f"explains {100 * kept.evidence['explained']:.0f} %" in kept.message
+    [open_] = [f for f in found.findings if f.code == "encoder_undetermined"]
+    assert open_.where == "FL_calf_joint"
+    [mirror] = [f for f in found.findings if f.code == "mirror_image"]
+    assert mirror.where == "FL_thigh_joint, FL_calf_joint"
+
+
+def test_parallel_axes_are_found_chain_by_chain(leg):
+    assert parallel_axes(leg[0].model) == [("FL_thigh_joint", "FL_calf_joint")]
+    arm = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"))
+    assert parallel_axes(arm) == [("shoulder_lift_joint", "elbow_joint", "wrist_1_joint")]
+
+
+def test_an_encoder_that_counts_the_other_way_is_turned(leg):
+    robot, log = leg
+    turned = log.turned(np.array([1.0, -1.0, 1.0]))
+    np.testing.assert_array_equal(turned.q[:, 1], -log.q[:, 1])
+    np.testing.assert_array_equal(turned.q_ref[:, [0, 2]], log.q_ref[:, [0, 2]])
+    sign = find_encoders(robot.model, [turned]).sign
+    # a chain with parallel axes is its mirror image: thigh or calf
+    assert sorted(sign[1:].tolist()) == [-1.0, 1.0]
+    assert sign[0] == 1.0
+
+
+MASS, LENGTH, KP, VISCOUS, COULOMB, DELAY = 0.5, 0.1, 0.17, 0.03, 0.06, 0.01
+STEP, RATE = 1e-4, 100.0  # [s] of MuJoCo, [Hz] of the log
+INERTIAL = f"""<inertial><origin xyz="0 0 -{LENGTH}"/><mass value="{MASS}"/>
+<inertia ixx="2e-4" iyy="2e-4" izz="2e-4" ixy="0" ixz="0" iyz="0"/></inertial>"""
+SERVO = f"""<robot name="servo"><link name="base"/><link name="arm">{INERTIAL}</link>
+<joint name="j" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/>
+<limit lower="-3" upper="3" effort="5" velocity="20"/></joint></robot>"""
+PLANT = f"""<mujoco><option timestep="{STEP}" integrator="implicitfast"/><worldbody><body>
+<joint name="j" axis="0 1 0" armature="1e-3" damping="{VISCOUS}" frictionloss="{COULOMB}"
+  solreffriction="2e-4 1" solimpfriction=".9999 .9999 .001 .5 2"/>
+<inertial pos="0 0 -{LENGTH}" mass="{MASS}" diaginertia="2e-4 2e-4 2e-4"/></body></worldbody>
+<actuator><motor joint="j"/></actuator></mujoco>"""
+
+
+def drooping(seed, duration=20.0, shake=0.0):
+    """Return the log of the servo; its stand turns by ``shake`` [rad] at 2.2 Hz."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(duration * RATE)) / RATE
+    q_ref = multisine(t, np.zeros(1), np.array([3.0]), rng, highest=2.0)
+    robot = mujoco.MjModel.from_xml_string(PLANT)
+    data, q, every, lag = mujoco.MjData(robot), [], round(1 / RATE / STEP), round(DELAY / STEP)
+    command = np.repeat(q_ref[:, 0], every)
+    for k in range(len(command)):
+        if k % every == 0:
+            q.append(data.qpos[0])
+        tilt = shake * np.sin(2 * np.pi * 2.2 * k * STEP)
+        robot.opt.gravity[:] = 9.81 * np.sin(tilt), 0.0, -9.81 * np.cos(tilt)
+        data.ctrl[0] = KP * (command[max(k - lag, 0)] - data.qpos[0])
+        mujoco.mj_step(robot, data)
+    q = np.array(q)[:, None] + 1e-3 * rng.standard_normal(q_ref.shape)
+    return Log(1000.0 + t, q, 0 * q, ("j",), q_ref=q_ref, has_torque=False)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    path = tmp_path_factory.mktemp("servo") / "servo.urdf"
+    path.write_text(SERVO)
+    return RobotModel.from_urdf(path)
+
+
+def test_a_weak_gain_is_found_where_gravity_exceeds_the_drive(model):
+    loop, settings = LoopSettings(), SimulationSettings()
+    found = identify_loops(model, [drooping(2)], [], loop, settings, chooses=False)
+    assert (found.fitted[0].rmse < 0.01 * found.fitted[0].spread).all()
+    values = dict(zip(found.fit.estimate.names, found.fit.estimate.theta, strict=True))
+    wanted = {"j.kp": KP, "j.viscous": VISCOUS, "j.coulomb": COULOMB, "robot.delay": DELAY}
+    for name, truth in wanted.items():
+        assert values[name] == pytest.approx(truth, rel=0.05), name
+
+
+def test_a_chosen_term_with_negative_friction_is_dropped_and_the_fit_goes_on(model):
+    """On a stand that swings, Stribeck friction would lower the error, but be negative at rest."""
+    log = drooping(1, shake=0.2)
+    found = identify_loops(model, [log], [], LoopSettings(kp=KP), SimulationSettings())
+    [finding] = [f for f in found.findings if f.code.startswith("friction")]
+    assert (finding.code, finding.severity, finding.where) == ("friction_dropped", "warning", "j")
+    assert "N m, wanted 0 or more. The term was dropped" in finding.message
+    [tried] = [t for t in found.fit.tried if t.dropped]
+    assert (tried.terms, tried.is_chosen) == (("stribeck",), False)
+    assert [term.name for term in found.fit.loops.terms[0]] == ["viscous", "coulomb", "offset"]

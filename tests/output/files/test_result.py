@@ -17,7 +17,6 @@ from robotid.base.exceptions import DataError, ModelError
 from robotid.base.findings import Finding
 from robotid.output.files.entries import _covariance, build_result, loop_entries, loop_parameters
 from robotid.output.files.result_file import read_result, stated_parameters
-from robotid.robot.parameters import INERTIAL_TERMS
 
 FINDINGS = [Finding("late", "warning", "a.csv", "late by 4 ms"), Finding("b", "note", "c", "d")]
 
@@ -40,69 +39,6 @@ def test_drives_behind_gears_have_their_inertia_at_the_motor(identified):
     assert motors == wanted
     each = [{"joints": [j], "matrix": [g["gear"]]} for j, g in wanted.items()]
     assert build_result(identified, {"transmission": each})["motors"] == wanted, "in two tables"
-
-
-def finite(value, rel=1e-6):
-    """Return what result.json has for a figure: none where it has no end."""
-    return pytest.approx(value, rel=rel) if np.isfinite(value) else None
-
-
-def test_base_parameters_have_values_errors_and_intervals(result, identified):
-    mapping = identified.mapping
-    beta = mapping.K @ identified.standard
-    half = identified.errors.quantile * identified.base_error
-    assert len({entry["std_error"] for entry in result["base_parameters"]}) == len(beta)
-    for k, entry in enumerate(result["base_parameters"]):
-        assert entry == {
-            "name": mapping.base_names[k],
-            "expression": mapping.expressions[k],
-            "value": pytest.approx(beta[k], rel=1e-9),
-            "std_error": finite(identified.base_error[k]),
-            "interval_95": [
-                finite(beta[k] - half[k], rel=1e-8),
-                finite(beta[k] + half[k], rel=1e-8),
-            ],
-            "unit": identified.model.layout.units[mapping.independent[k]],
-        }
-
-
-def test_standard_and_drive_parameters_have_value_error_prior_and_source(result, identified):
-    layout = identified.model.layout
-    links = [f"{body}.{term}" for body in layout.bodies for term in INERTIAL_TERMS]
-    terms = ("armature", "viscous", "coulomb", "offset")
-    drives = [f"{joint}.{term}" for joint in identified.model.joints for term in terms]
-    entries = [*result["standard_parameters"], *result["drive_parameters"]]
-    assert [entry["name"] for entry in result["standard_parameters"]] == links
-    assert {entry["name"] for entry in result["drive_parameters"]} == set(drives)
-    urdf = [body.toDynamicParameters() for body in list(identified.model.pin_model.inertias)[1:]]
-    # what no drive can have less of, and noise of 8 N m on the joint leaves nothing of
-    names_at_bound = [
-        entry["name"]
-        for entry in entries[60:]
-        if not entry["name"].endswith("offset") and entry["value"] < 1e-6
-    ]
-    assert names_at_bound == ["elbow_joint.viscous"]
-    for i, entry in enumerate(entries):
-        assert entry == {
-            "name": layout.names[i],
-            "value": identified.standard[i],
-            "std_error": None
-            if entry["at_bound"]
-            else pytest.approx(np.sqrt(identified.standard_covariance[i, i])),
-            "quantile": None if entry["at_bound"] else identified.standard_quantile[i],
-            "interval_95": [None, None]
-            if entry["at_bound"]
-            else list(identified.standard_interval[i]),
-            "unit": layout.units[i],
-            "prior": identified.prior[i],
-            "source": identified.sources[i],
-            "at_bound": i >= 60 and names_at_bound.count(layout.names[i]) == 1,
-            **({} if i < 60 else {"with_urdf": identified.urdf_with_drives[i]}),
-        }
-    np.testing.assert_allclose(
-        [entry["prior"] for entry in entries[:60]], np.concatenate(urdf), atol=1e-12
-    )
-    assert sum(entry["prior"] != entry["value"] for entry in entries) > 40
 
 
 def assert_metrics(found, wanted):
