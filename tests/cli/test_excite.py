@@ -81,7 +81,7 @@ def test_the_page_of_a_motion_states_the_errors_that_a_preview_of_it_expects(des
         (["--max-jerk", "wrist_1_joint=1e300"], "jerk of 'wrist_1_joint' is 1e+300, wanted"),
         (["--box", "post=0,0,0,1,1,nan"], "the lower and the upper corner [m], within 1000 m"),
         (["--criterion", "widest"], "criterion is widest, which needs an earlier result"),
-        (["--kind", "sweeps", "--max-jerk", "wrist_1_joint=1"], "% of its jerk limit at "),
+        (["--kind", "sweeps", "--max-jerk", "wrist_1_joint=100"], "needs 211 % of its jerk limit"),
     ],
 )
 def test_bad_flags_are_refused_before_anything_is_written(tmp_path, capsys, words, message):
