@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from robotid.base.exceptions import ModelError
 from robotid.base.files import write_text
 from robotid.base.findings import listed
+from robotid.base.settings import require_kind
 from robotid.base.text import yaml_name, yaml_plain
 from robotid.base.tolerances import ROUNDING
 from robotid.base.typing import Array
@@ -261,6 +262,8 @@ def write_model(
     notes: Sequence[str] = (),
 ) -> tuple[str, ...]:
     """Write a robot in the format of a simulator: pi (p,)."""
+    require_kind(target, (str, Path), "target", "the path of a file to write")
+    require_kind(original, (str, Path, type(None)), "original", "the path of a URDF, or none")
     inertials, meshes = _inertials(model, pi), set[str]()
     shapes = _shapes(model, to, [*([original] if original else []), model.tree.path], meshes)
     values = dict(zip(model.layout.names, pi.tolist(), strict=True))

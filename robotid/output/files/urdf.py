@@ -18,6 +18,7 @@ import numpy as np
 from robotid.base.exceptions import DataError, ModelError
 from robotid.base.files import check_folder, folder_beside, read_json
 from robotid.base.findings import listed
+from robotid.base.settings import require_kind
 from robotid.base.tolerances import ROUNDING, TINY
 from robotid.base.typing import Array
 from robotid.base.versions import __version__
@@ -190,7 +191,9 @@ def _drive_value(drives: Mapping[str, Any], name: str, where: str) -> float:
 
 
 def _check_parameters(model: RobotModel, pi: Array) -> None:
+    require_kind(model, RobotModel, "model", "a robotid.RobotModel")
     wanted = (len(model.layout.names),)
+    require_kind(pi, np.ndarray, "pi", f"an array of shape {wanted}")
     if pi.shape != wanted:
         raise DataError(f"pi has shape {pi.shape}, wanted {wanted}")
     for name, value in zip(model.layout.names, pi, strict=True):
