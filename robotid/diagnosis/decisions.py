@@ -13,6 +13,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from scipy.special import stdtr
 
+from robotid.base.tolerances import TINY as TINY  # of this package's tests, too
 from robotid.base.typing import Array
 
 
@@ -70,7 +71,6 @@ OUTLIER = 12.0  # Typical residuals above which a sample is excluded
 BEYOND_NOISE = 3.0  # Standard errors, or deviations, beyond which a value is no noise
 SHARE_OF_ROWS = 0.02  # Share of the rows from which a fault of single rows is reported
 ROWS = 2000  # Instants of a motion that are used: more are not independent after the filter
-TINY = 1e-6  # Relative size below which a quantity counts as 0
 #: Share of a column below which it is rounding, and relative step of a derivative by a shape.
 ROUNDING, STEP = 1e-10, 1e-3
 #: Size of the correlation from which two parameters or signals are strongly correlated: if one were

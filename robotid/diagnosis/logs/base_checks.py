@@ -10,7 +10,7 @@ from robotid.base.exceptions import DataError
 from robotid.base.findings import Finding
 from robotid.base.text import seconds
 from robotid.base.typing import Array
-from robotid.data.base_motion import ImuFrame, base_state, in_base, pose_jumps
+from robotid.data.base_motion import LEVEL, ImuFrame, base_state, in_base, pose_jumps
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
@@ -50,8 +50,7 @@ _ALONG = 0.8  # component of the unit vector from the feet to the base that may 
 # [s] over which the acceleration of a base is averaged; [m/s^2] RMS of it above which it is in mm
 _STRIDE, _FASTEST = 0.2, 30.0
 _IMU_MOVES = 0.1  # [rad/s] RMS from which angular velocities are compared
-# [deg] largest angle of the mean specific force from the vertical; [s] its mean is then gravity
-_TILT, _SHORTEST = 8.0, 2.0
+_TILT = 8.0  # [deg] largest angle of the mean specific force from the vertical
 
 
 def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator[Finding]:
@@ -406,7 +405,7 @@ def rms(values: Array) -> float:
 
 def check_imu(log: Log, motion: Trajectory) -> Iterator[Finding]:
     """Yield findings on the IMU of one log."""
-    if log.base is None or log.base.imu is None or motion.t[-1] - motion.t[0] < _SHORTEST:
+    if log.base is None or log.base.imu is None or motion.t[-1] - motion.t[0] < LEVEL:
         return
     yield from _check_gyroscopes(log, motion)
     yield from _check_gravity(log, log.base.imu.frame, motion)

@@ -10,13 +10,13 @@ import numpy as np
 from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
 from robotid.data.log import Log
-from robotid.data.units import quantum
+from robotid.data.units import LONG_STEP, quantum
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import CORRELATED, DIFFERS, SHARE_OF_ROWS, SIGNIFICANT, connected
 from robotid.diagnosis.logs.channels import runs_of
 from robotid.estimation.fitting.standard_errors import QUANTILE
 
-_SECONDS, _GAP = 5.0, 5  # [s] of the averaged spectra; [median steps] a longer one ends a segment
+_SECONDS = 5.0  # [s] of the averaged spectra
 _COHERENT, _COHERENCE = 0.8, 0.999  # least of a frequency that is used, largest that is believed
 _EXCITED = 1e-4  # least power of a command, over that of its strongest frequency
 _HALF_POWER = np.sqrt(0.5)  # response at the bandwidth of a loop, over the response at rest
@@ -95,7 +95,7 @@ class _Loop:
     @cached_property
     def rows(self) -> slice:
         """The longest segment without a gap."""
-        breaks = np.flatnonzero(np.diff(self.log.t) > _GAP * self.step) + 1
+        breaks = np.flatnonzero(np.diff(self.log.t) > LONG_STEP * self.step) + 1
         edges = np.array([0, *breaks, len(self.log.t)])
         k = int(np.argmax(np.diff(edges)))
         return slice(int(edges[k]), int(edges[k + 1]))

@@ -14,9 +14,10 @@ from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import low_pass
+from robotid.data.units import AT_REST
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import BEYOND_NOISE, ROUNDING, ROWS
-from robotid.diagnosis.logs.channels import AT_REST, MOVING, distance
+from robotid.diagnosis.logs.channels import MOVING, distance
 from robotid.diagnosis.logs.hypotheses import coupled_columns, smooth_motion
 from robotid.dynamics.rows import inertial_rows
 from robotid.robot.model import RobotModel

@@ -11,9 +11,10 @@ import numpy as np
 import scipy.special
 
 from robotid.base.findings import listed
+from robotid.base.tolerances import TINY
 from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import sentence_of
-from robotid.diagnosis.decisions import AGREES, DIFFERS, TINY
+from robotid.diagnosis.decisions import AGREES, DIFFERS
 from robotid.dynamics.constraint_rows import loop_basis, without_forces
 from robotid.dynamics.torque import joint_torque_regressor, predict
 from robotid.estimation.fitting.fitted import Fit
