@@ -73,5 +73,3 @@ def numbers_of(packed):
     values = np.array(packed["low"]) + np.array(packed["step"]) * codes
     values = np.where(codes == np.iinfo(codes.dtype).max, np.nan, values)
     return 10.0**values if packed.get("log") else values
-
-
