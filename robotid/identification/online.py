@@ -16,7 +16,9 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.settings import NOT_NEGATIVE, POSITIVE, Settings, is_number, require_kind, setting
 from robotid.base.typing import Array, real_numbers
+from robotid.data.base_motion import GAP_STEPS
 from robotid.data.log import Log, Trajectory
+from robotid.data.signals import GAP_CYCLES
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import Sample
 from robotid.dynamics.rows import sure_rows
@@ -30,7 +32,6 @@ Instant = tuple[float, Array, Array, Array, Array]
 
 _ORDER = 4  # of the causal filter, even
 _SLOWEST = 1e-5  # smallest cut-off over the rate
-_GAP_CYCLES = 0.25  # longest pause without a gap [periods of the cut-off]
 _SETTLE = 4.0  # time after a start or a gap before the first instant [delays]
 
 
@@ -49,7 +50,7 @@ class LiveSignals:
             )
         self._step, self._n = 1.0 / rate, n
         self._is_continuous = np.asarray(is_continuous, dtype=bool)
-        self._gap = max(_GAP_CYCLES / cutoff, 2.5 / rate)
+        self._gap = max(GAP_CYCLES / cutoff, GAP_STEPS / rate)
         self._M = _bessel(_ORDER, cutoff, rate)  # [x; y]_k+1 = M [x; u]_k
         A, B, C = self._M[:-1, :-1], self._M[:-1, -1:], self._M[-1:, :-1]
         inverse = np.linalg.inv(np.eye(_ORDER) - A)

@@ -16,6 +16,7 @@ from unittest import mock
 
 import lxml.html
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from helpers.pages import numbers_of
 from robotid.cli import main
@@ -100,19 +101,22 @@ class Runs:
 
     def lines(self, text):
         """Return the lines of a text, blanks inside them counting as one."""
-        return [line for line in map(self.line, text.split("\n")) if line.strip()]
+        lines = _with_tensors(text).split("\n")
+        return [line for line in map(self.line, lines) if line.strip()]
 
     def line(self, text):
-        text = _axes_apart(text.replace(str(self.folder), "FOLDER"))
+        text = text.replace(str(self.folder), "FOLDER")
+        text = re.sub(r"(condition number) (?:\d{7,}|infinite)", r"\1 of a singular matrix", text)
         indent = text[: len(text) - len(text.lstrip())]
         return _shortened(indent + " ".join(_VARIES.sub("...", text).split()))
 
     def scrubbed(self, value, key=""):
         """Return a JSON value without what changes from run to run, figures rounded."""
         if isinstance(value, dict):
+            if "principal_axes" in value:
+                moments = [x["nominal"] for x in value["principal_moments"].values()]
+                value = value | {"principal_axes": _tensor(value["principal_axes"], moments)}
             return {k: self.scrubbed(x, k) for k, x in value.items() if k not in _LEFT_OUT}
-        if key == "principal_axes":
-            return sorted(round(abs(x), 5) for x in value)
         if key == "condition_number" and (value is None or value > _SINGULAR):
             return "of a singular matrix"
         if isinstance(value, list):
@@ -126,19 +130,41 @@ class Runs:
         return rounded(value)
 
 
-#: Of principal axes: which of them is which, and whose sign is plus, is a matter of rounding.
-_AXES = re.compile(r'((?:"principal_axes": \[|<inertial [^>]*quat="))([^]"]+)')
+#: Axes and moments of an inertia. Which axis is which, and whose sign is plus, is a matter of
+#: rounding: what is kept is the tensor.
+_INERTIA = re.compile(r'<inertial .*?quat="([^"]+)".*? diaginertia="([^"]+)"')
+_AXES = re.compile(r'(?<="principal_axes": \[)([^]]+)(?=\]\n(?:.*\n){4}.*principal_moments)')
+_MOMENT = re.compile(r'"I(?:xx|yy|zz)": {nominal: ([^,]+)')
 
 
-def _axes_apart(text):
-    """Return a line whose principal axes are told by the sizes of their quaternion."""
+def _tensor(axes, moments):
+    """Return the inertia (xx, xy, xz, yy, yz, zz) of principal axes w, x, y, z and moments."""
+    R = Rotation.from_quat(axes, scalar_first=True).as_matrix()
+    tensor = (R * moments) @ R.T
+    return tensor[np.triu_indices(3)].tolist()
 
-    def axes(found):
-        words = found[2].replace(",", " ").split()
-        return found[1] + ", ".join(f"{x:.5f}" for x in sorted(abs(float(word)) for word in words))
 
-    text = re.sub(r"(condition number) (?:\d{7,}|infinite)", r"\1 of a singular matrix", text)
-    return _AXES.sub(axes, text)
+def _told(axes, moments):
+    """Return that inertia as text, to five digits of the largest moment."""
+    digits = 4 - math.floor(math.log10(max(moments)))
+    return ", ".join(f"{round(x, digits) + 0.0:.{digits}f}" for x in _tensor(axes, moments))
+
+
+def _numbers(text):
+    return [float(word) for word in text.replace(",", " ").split()]
+
+
+def _with_tensors(text):
+    """Return a text whose principal axes are told by the inertia in the link's frame."""
+
+    def of_ranges(found):
+        moments = _MOMENT.findall(text, found.end())[:3]
+        return _told(_numbers(found[0]), _numbers(" ".join(moments)))
+
+    def of_mjcf(found):
+        return found[0].replace(found[1], _told(*map(_numbers, found.groups())))
+
+    return _INERTIA.sub(of_mjcf, _AXES.sub(of_ranges, text))
 
 
 def rounded(value, digits=_DIGITS):
@@ -205,6 +231,7 @@ def page_content(html):
         href = element.get("href", "")
         told = [element.get(key) for key in ("aria-label", "title", "style")]
         told.insert(2, "" if href.startswith("#") else href)
+        told += ["open"] * ("open" in element.attrib)
         words = [f"[{word}]" for word in told if word]
         words += ["|"] * (element.tag in ("td", "th"))
         if element.tag in ("tr", "div", "td") and element.get("class"):
@@ -278,7 +305,8 @@ def differences(stored, found, at="", *, times=1.0, room=0.0):
         if len(stored) != len(found):
             yield f"{at}: {len(stored)} entries stored, {len(found)} found"
         largest = max((abs(x) for x in stored if _is_number(x)), default=0.0)
-        floor = room or times * FLOOR * largest
+        of_largest = RELATIVE if at.endswith("/principal_axes") else FLOOR
+        floor = room or times * of_largest * largest
         for i, (x, y) in enumerate(zip(stored, found, strict=False)):
             yield from differences(x, y, f"{at}/{i}", times=times, room=floor)
     elif _is_number(stored) and _is_number(found):

@@ -1,5 +1,6 @@
 """A job whose logs are read in pieces ends where the same job in memory ends."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -63,23 +64,51 @@ def assert_same(one, other, first, second):
     off = np.log(other.base_error / one.base_error) / known
     assert np.sqrt(np.mean(off**2)) < 1.25, off
     assert np.abs(off).max() < 4.0, off
-    assert other.verdict.status == one.verdict.status
-    condition = pytest.approx(first["structure"]["condition"])
-    assert second["structure"] == {**first["structure"], "condition": condition}
-    assert [second[key] for key in ("joints", "outputs")] == [first["joints"], first["outputs"]]
+    causes = [x for x in _reasons(first) if "largest error" in x]  # one side may find another
+    for verdict in (first["verdict"], *first["verdict"]["per_joint"].values()):
+        verdict["reasons"] = [x for x in verdict["reasons"] if x not in causes]
+    for key, rtol in TOLERANCES.items():
+        assert_close(second[key], first[key], rtol)
+    for key in ("identification", "validation"):
+        assert_close(second["wls"][key], first["wls"][key], 1e-8)
     assert {w["code"] for w in second["warnings"]} == {w["code"] for w in first["warnings"]}
-    for found, wanted in zip(second["inputs"], first["inputs"], strict=True):
-        figures = {k: pytest.approx(x) for k, x in wanted.items() if isinstance(x, float)}
-        assert found == {**wanted, **figures}
 
 
-def errors_of(evaluations):
-    """Return the metrics of each joint of evaluations, of the estimate and of WLS."""
-    return np.array([
-        [m.rmse, m.relative_error_pct, m.baselines["urdf"], m.rows]
-        for e in evaluations for name in ("estimate", "wls")
-        for m in e.metrics[name].per_joint.values()
-    ])  # fmt: skip
+#: Of the parts of result.json.
+TOLERANCES = dict.fromkeys(("verdict", "structure", "joints", "outputs"), 1e-6)
+TOLERANCES |= {"inputs": 1e-14, "identification": 1e-5, "validation": 1e-5}
+
+
+def _reasons(content):
+    verdict = content["verdict"]
+    return [x for part in (verdict, *verdict["per_joint"].values()) for x in part["reasons"]]
+
+
+def leaves(value, place=""):
+    """Yield the values of JSON by place, of texts the words and the figures, which are rounded.
+
+    Bands and expected errors follow standard errors: pieces cut segments elsewhere.
+    """
+    if isinstance(value, str):
+        words = re.split(r"(\d+\.?\d*)", value)
+        yield place, "#".join(words[::2])
+        yield f"{place} figures", [float(x) for x in words[1::2]]
+    elif isinstance(value, dict | list):
+        for key, x in value.items() if isinstance(value, dict) else enumerate(value):
+            if key not in ("band", "expected"):
+                yield from leaves(x, f"{place}/{key}")
+    else:
+        yield place, value
+
+
+def assert_close(found, wanted, rtol):
+    """Check values of JSON, numbers to a tolerance."""
+    values = dict(leaves(wanted))
+    for key, x in values.items():
+        if isinstance(x, float | list):
+            rel = 0.015 if isinstance(x, list) else rtol
+            values[key] = pytest.approx(x, rel=rel, abs=1e-12)
+    assert dict(leaves(found)) == values
 
 
 def test_a_job_in_pieces_ends_where_it_ends_in_memory(noisy_job, tmp_path):
@@ -89,21 +118,13 @@ def test_a_job_in_pieces_ends_where_it_ends_in_memory(noisy_job, tmp_path):
     ]
     (one, first), (other, second) = runs
     assert_same(one, other, first, second)
-    for key in ("fitted", "validation"):
-        wanted, found = (errors_of(getattr(x, key)) for x in (one, other))
-        np.testing.assert_allclose(found, wanted, rtol=1e-5)
     # all samples are drawn of one so short
     assert [e.recording.is_partial for e in other.validation] == [False, False]
     assert other.fitted[0].recording.name == one.fitted[0].recording.name
     assert second["settings"]["reduction"] == {"rows_in_memory": HELD}
     kept = noisy_job.validation[0].path
-    again = [
-        validate(tmp_path / str(rows) / "result.json", [kept])["validation"][0]["per_joint"]
-        for rows in (10**9, HELD)
-    ]
-    for joint, wanted in again[0].items():
-        error = again[1][joint]["relative_error_pct"]
-        assert error == pytest.approx(wanted["relative_error_pct"], rel=1e-5)
+    again = [validate(tmp_path / str(x) / "result.json", [kept]) for x in (HELD, 10**9)]
+    assert_close(*(x["validation"] for x in again), 1e-5)
 
 
 @pytest.mark.parametrize("name", ["rls", "prx"])  # one pass and several

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
-from robotid.base.settings import require_kind
+from robotid.base.settings import require_each, require_kind
 from robotid.base.typing import Array
 from robotid.output.files.exports import (
     WORLD,
@@ -168,6 +168,7 @@ def write_mjcf(
         raise SettingsError(f"step is {step:g} s, wanted a positive time")
     if delay not in DELAYS:
         raise SettingsError(f"delay is {delay!r}, wanted one of {listed(DELAYS)}")
+    require_each(commanded, CommandedDrive, "commanded", "a list of drives")
     to = XmlFormat("MJCF", _TERMS, True, _is_readable)
     servos = _Servos({drive.joint: drive for drive in commanded}, step, delay)
     build = partial(_mjcf, model, servos)

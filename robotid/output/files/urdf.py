@@ -18,6 +18,8 @@ import numpy as np
 from robotid.base.exceptions import DataError, ModelError
 from robotid.base.files import check_folder, folder_beside, read_json
 from robotid.base.findings import listed
+from robotid.base.settings import require_kind
+from robotid.base.tolerances import ROUNDING, TINY
 from robotid.base.typing import Array
 from robotid.base.versions import __version__
 from robotid.dynamics.friction_projection import Projection
@@ -41,9 +43,7 @@ from robotid.robot.tree import MOMENTS, Inertial
 #: The drive terms of ``<dynamics>``.
 DYNAMICS_TERMS = tuple(name for name, term in TERMS.items() if term.dynamics)
 _SCHEMA_VERSION = 1
-ROUNDING = 1e-12  # of the size of a parameter or a link, below which a difference is 0
 _STATES = 64  # random states at which the written file must give the same torque
-_SAME = 1e-6  # largest relative difference of a row's torque over these states
 
 
 def write_urdf(
@@ -191,7 +191,9 @@ def _drive_value(drives: Mapping[str, Any], name: str, where: str) -> float:
 
 
 def _check_parameters(model: RobotModel, pi: Array) -> None:
+    require_kind(model, RobotModel, "model", "a robotid.RobotModel")
     wanted = (len(model.layout.names),)
+    require_kind(pi, np.ndarray, "pi", f"an array of shape {wanted}")
     if pi.shape != wanted:
         raise DataError(f"pi has shape {pi.shape}, wanted {wanted}")
     for name, value in zip(model.layout.names, pi, strict=True):
@@ -336,7 +338,7 @@ def _check_torque(model: RobotModel, pi: Array, urdf: Path, sidecar: Path) -> No
         )
     )
     difference = np.linalg.norm(found - wanted, axis=0)  # (n_rows,)
-    off = np.flatnonzero(difference > _SAME * np.linalg.norm(wanted, axis=0))
+    off = np.flatnonzero(difference > TINY * np.linalg.norm(wanted, axis=0))
     if off.size:
         raise ModelError(
             f"{urdf.name} is not written: in the test reading, its torque differs from that of the "
