@@ -18,7 +18,7 @@ from robotid.data.files.columns import Needs
 from robotid.data.files.read import LogLayout
 from robotid.data.files.table import Table
 from robotid.data.log import Log
-from robotid.diagnosis.logs.channels import STILL
+from robotid.data.units import STILL
 from robotid.diagnosis.logs.check_logs import check_locked, diagnose, percent_hint
 from robotid.diagnosis.verdict.fit_findings import log_findings
 from robotid.diagnosis.verdict.verdict import check_ignored

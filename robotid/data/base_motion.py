@@ -24,7 +24,7 @@ IMU = ("qx", "qy", "qz", "qw", "wx", "wy", "wz", "ax", "ay", "az")
 _WINDOW = 0.5  # [s] shortest rest in which the bias of the gyroscopes is estimated
 _STILL = 0.02  # [rad/s] largest standard deviation of a gyroscope at rest
 _UNMOVED = 5e-3  # [rad or m] largest motion of a joint at rest
-_LEVEL = 2.0  # [s] in which the mean specific force is vertical; the mean is taken twice
+LEVEL = 2.0  # [s] in which the mean specific force is vertical
 _BREAK = 0.1  # [s] a longer time step: the angular velocity in it is not known
 _POSE_REMEDY = (
     "Record base_x, base_y, base_z [m] and the orientation base_qx, base_qy, base_qz, base_qw, or "
@@ -426,7 +426,7 @@ def _mean(t: Array, x: Array) -> Array:
     """Return the mean of values over some time around each sample, same shape, taken twice."""
     if len(t) < 2:
         return x
-    first, last = (np.clip(t + side * _LEVEL / 2, t[0], t[-1]) for side in (-1, 1))
+    first, last = (np.clip(t + side * LEVEL / 2, t[0], t[-1]) for side in (-1, 1))
     for _ in range(2):
         areas = 0.5 * np.diff(t)[:, None] * (x[1:] + x[:-1])
         integral = np.vstack([np.zeros(x.shape[1]), np.cumsum(areas, axis=0)])

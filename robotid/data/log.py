@@ -13,7 +13,13 @@ import numpy as np
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed, suggestion
-from robotid.base.settings import is_number, require_each, require_flag, require_kind
+from robotid.base.settings import (
+    LARGEST_SETTING,
+    is_number,
+    require_each,
+    require_flag,
+    require_kind,
+)
 from robotid.base.text import seconds
 from robotid.base.typing import Array, frozen, real_numbers
 from robotid.data.base_motion import POSE, BaseMotion
@@ -35,7 +41,6 @@ _BY_SAMPLE = (
     "t", "q", "v", "a", "tau", "segment", "direction", "memory", "contacts",
     "wrenches", "switching", "basis", "loaded",
 )  # fmt: skip
-_LARGEST = 1e30  # in any unit, so that squares and products are finite
 _BLOCK = 2**17  # stamps processed together
 #: Share of the instants of a motion in another one, from which it repeats that.
 REPEATED = 0.3
@@ -388,7 +393,7 @@ def require_finite(
     values: Array, t: Array, names: Sequence[str], where: str, first: int = 0
 ) -> None:
     """Reject NaN, infinite values and values beyond 1e30; the error names the first: t (N,) [s]."""
-    is_fine = np.abs(values) <= _LARGEST  # False for NaN, too
+    is_fine = np.abs(values) <= LARGEST_SETTING  # False for NaN, too
     if is_fine.all():
         return
     row, column = (int(i) for i in np.argwhere(~is_fine)[0])

@@ -19,6 +19,7 @@ from robotid.base.settings import (
     require_kind,
     setting,
 )
+from robotid.base.tolerances import SINGULAR
 from robotid.base.typing import Array
 from robotid.data.log import repeated
 
@@ -27,7 +28,6 @@ PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _HZ = Range("0.001 to 1e6", lambda x: 1e-3 <= x <= 1e6)
 _MEASURED = ("auto", "measured", "differentiated")
 _DELAY = Range("seconds between -1 and 1", lambda x: abs(x) <= 1)
-_SINGULAR = 1e-9  # smallest singular value over the largest, for rows of length 1
 
 
 def or_false(if_true: str) -> dict[str, Any]:
@@ -359,7 +359,7 @@ class Transmission(Settings):
             )
         size = np.linalg.norm(self.T, axis=1, keepdims=True)
         sizes = np.linalg.svd(self.T / np.where(size > 0, size, 1.0), compute_uv=False)
-        if not sizes[-1] > _SINGULAR * sizes[0]:
+        if not sizes[-1] > SINGULAR * sizes[0]:
             raise SettingsError(
                 f"transmission of {listed(self.joints)}: matrix {shown} is singular, so the motor "
                 "positions do not determine the joint positions. Each row is a motor, as "

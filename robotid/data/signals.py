@@ -22,7 +22,7 @@ from robotid.data.units import is_trustworthy
 
 _SLOWEST = 1e-6  # smallest cut-off over the rate
 _UNWRAPPED: WeakKeyDictionary[Log, Log] = WeakKeyDictionary()
-_GAP_CYCLES = 0.25  # [periods of the filter] shortest gap, if it is longer than ``GAP_STEPS``
+GAP_CYCLES = 0.25  # [periods of the filter] shortest gap, if it is longer than ``GAP_STEPS``
 #: Rows after which the end of a cubic spline has no effect: it decreases by half or more per row.
 SPLINE = 64
 _SETTLED = 42.0  # [time constants] after which a filter's transient is negligible: 6e-19
@@ -95,7 +95,7 @@ def decide(
         acceleration = "measured" if is_used else "differentiated"
     gap = settings.max_gap
     if gap is None:
-        gap = max(GAP_STEPS * step, _GAP_CYCLES / cutoff if cutoff else 0.0)
+        gap = max(GAP_STEPS * step, GAP_CYCLES / cutoff if cutoff else 0.0)
     return replace(settings, rate=rate, velocity=velocity, acceleration=acceleration, max_gap=gap)
 
 

@@ -22,12 +22,15 @@ _FREE = 10 * np.pi  # [rad] ... one without limits beyond five: pendulums were r
 LARGEST_LAG = 0.02
 #: Least number of steps over the range of a channel with sufficient resolution.
 COARSE = 100
+AT_REST = 0.02  # [rad/s, or m/s of a prismatic joint] slower: at rest
+STATIC = 1e-3  # [rad or m] smaller range: the joint does not move
+#: Largest range of a locked joint, and largest difference from its stated position [rad or m].
+STILL = 0.02
+LONG_STEP = 5  # [median steps] a longer step is a gap, however irregular the rows are
 _FEWEST = 8  # least number of rows of a segment in which a lag is estimated
 _LONGEST = 0.3  # [s] largest lag that is tested
 _UNLIKE = 0.5  # correlation below which a velocity is not the derivative of its position
-_MOVED, _SPEED = 1e-3, 0.02  # [rad or m], [rad/s or m/s] smaller values: at rest
 _SEGMENT = 0.1  # [s] over which the motion is averaged against noise and jitter
-_GAP = 5  # [median steps] a longer step is a gap
 _ALIKE = 0.9  # correlation from which two signals are proportional
 _NEAR = 0.1  # relative tolerance of the factor between them
 
@@ -200,7 +203,7 @@ def _displacements(log: Log, v: Array) -> tuple[Array, Array]:
     median = float(np.median(dt))
     length = int(np.clip(round(_SEGMENT / median), 1, max(1, len(dt) // 4)))
     jump = _is_near(np.abs(step), 2 * np.pi) | _is_near(np.abs(step), 360.0)
-    used = (dt <= _GAP * median) & ~jump
+    used = (dt <= LONG_STEP * median) & ~jump
     totals = (np.cumsum(np.vstack([0.0 * x[:1], used * x]), axis=0)
               for x in (step, dt * (v[1:] + v[:-1]) / 2))  # fmt: skip
     moved, integral = (total[length:] - total[:-length] for total in totals)
@@ -241,7 +244,7 @@ def velocity_lags(log: Log) -> tuple[float, Array]:
     v = _measured(log)
     step = float(np.median(np.diff(log.t)))
     q = np.unwrap(log.q, axis=0)
-    parts = np.split(np.arange(len(log.t)), np.flatnonzero(np.diff(log.t) > _GAP * step) + 1)
+    parts = np.split(np.arange(len(log.t)), np.flatnonzero(np.diff(log.t) > LONG_STEP * step) + 1)
     longest = min(int(_LONGEST / step) + 1, max(map(len, parts)) // 4)
     shifts = np.arange(-longest, longest + 1)
     total = np.zeros((len(log.joints), len(shifts)))
@@ -286,7 +289,7 @@ def unlike_velocities(log: Log) -> dict[str, float]:
     unlike = {}
     for j, joint in enumerate(log.joints):
         speed = float(np.sqrt(np.mean(moved[:, j] ** 2))) / (length * median)
-        if np.ptp(log.q[:, j]) < _MOVED or speed < _SPEED or np.ptp(v[:, j]) == 0:
+        if np.ptp(log.q[:, j]) < STATIC or speed < AT_REST or np.ptp(v[:, j]) == 0:
             continue
         largest = max(_correlation(moved[:, j], integral[:, j], k) for k in [0, *shifts])
         if largest < _UNLIKE:

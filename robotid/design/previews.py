@@ -36,9 +36,9 @@ from robotid.dynamics.factors import Factors, compress, join, merge
 from robotid.dynamics.prepared_logs import base_problem, independent_share
 from robotid.dynamics.torque import predict, predict_instants
 from robotid.estimation.estimators import Estimate
-from robotid.estimation.estimators.batch import solve_factor
+from robotid.estimation.estimators.batch import LEAST_NOISE, solve_factor
 from robotid.estimation.estimators.determination import base_spread, determine
-from robotid.estimation.estimators.estimator import FEWEST_SEGMENTS, scatter
+from robotid.estimation.estimators.estimator import FEWEST_SEGMENTS, LEAST_FREEDOM, scatter
 from robotid.estimation.fitting.estimator_settings import (
     ConsistentSettings,
     EstimatorSettings,
@@ -70,8 +70,6 @@ FAINTEST = 1e-3
 #: Typical weight of a consistent fit's prior with "auto", and the plausible weight: the largest one
 #: that held-out segments do not reject, for robots that differ from their URDF as much.
 _WEIGHT = (10.0, 1.0)
-_EXACT = 1e-9  # smallest residual of a joint, as a share of the largest one
-_LEAST_FREE = 0.1  # smallest share of residual degrees of freedom in a joint's samples
 _IMPULSE = 40.0  # periods of the filter after which its impulse response is 0
 
 
@@ -183,7 +181,7 @@ class Run:
         # parameters, weighted by the joint's share of their variance
         factors, beta = self.factors, K @ self.standard
         sigma = np.sqrt(factors.residual_squares(beta) / np.maximum(factors.rows, 1))
-        sigma = np.maximum(sigma, _EXACT * max(float(sigma.max()), _EXACT))
+        sigma = np.maximum(sigma, LEAST_NOISE * max(float(sigma.max()), LEAST_NOISE))
         bread = solve_factor(factors, sigma, beta).covariance
         inflation = np.full(len(sigma), 1.0 / self.share)
         if len(self.segments) >= FEWEST_SEGMENTS:
@@ -196,7 +194,7 @@ class Run:
                 ratio = np.log(scattered[counts] / own[counts])
                 inflation[j] = np.exp(np.average(ratio, weights=share[counts]))
         effective = factors.leverages(bread) / sigma**2  # degrees of freedom
-        free = np.maximum(1.0 - effective / np.maximum(factors.rows, 1), _LEAST_FREE)
+        free = np.maximum(1.0 - effective / np.maximum(factors.rows, 1), LEAST_FREEDOM)
         # its density is sigma^2 inflation step, whatever its standard deviation is
         return TorqueNoise(
             sigma / np.sqrt(free), free * inflation * self.step, ("found",) * len(sigma)

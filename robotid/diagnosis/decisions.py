@@ -13,6 +13,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from scipy.special import stdtr
 
+from robotid.base.tolerances import TINY as TINY  # of this package's tests, too
 from robotid.base.typing import Array
 
 
@@ -70,7 +71,6 @@ OUTLIER = 12.0  # Typical residuals above which a sample is excluded
 BEYOND_NOISE = 3.0  # Standard errors, or deviations, beyond which a value is no noise
 SHARE_OF_ROWS = 0.02  # Share of the rows from which a fault of single rows is reported
 ROWS = 2000  # Instants of a motion that are used: more are not independent after the filter
-TINY = 1e-6  # Relative size below which a quantity counts as 0
 #: Share of a column below which it is rounding, and relative step of a derivative by a shape.
 ROUNDING, STEP = 1e-10, 1e-3
 #: Size of the correlation from which two parameters or signals are strongly correlated: if one were
@@ -82,6 +82,8 @@ AGREES = 0.05
 DIFFERS = 2 * AGREES
 #: Factor beyond which a torque or a total mass is no error of the URDF's masses.
 NO_ERROR_OF_MASSES = 3.0
+#: Ratio of the residuals of two explanations below which the first is clearly the better one.
+BETTER = 0.5
 SCATTERED = 3  # Segments from which a scatter is determined
 NOTHING = 1e-300  # A sum of squares that is 0, as a divisor
 Option = TypeVar("Option", bound=Hashable)

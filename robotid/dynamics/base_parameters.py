@@ -11,6 +11,7 @@ import numpy as np
 import scipy.linalg
 
 from robotid.base.exceptions import DataError
+from robotid.base.tolerances import LEAST_DIVISOR, SINGULAR, TINY
 from robotid.base.typing import Array
 from robotid.dynamics.factors import Problem, triangle_of
 from robotid.dynamics.torque import random_regressor
@@ -19,11 +20,7 @@ from robotid.robot.model import RobotModel
 #: Pivots below this share of the largest count as 0. Over example-robot-data, every pivot is above
 #: 1e-3 or below 1e-12, except with rounded angles in a URDF (3.1416): 1e-5 to 1e-6.
 RANK_TOLERANCE = 1e-4
-_CLOSED_RANK = 1e-9  # the same for closed chains, whose small motions have pivots down to 1e-6
-_TIE = 1e-6  # share by which each column is shortened relative to the one before it
-_FAINTEST = 1e-12  # norm of a column that is 0 at every state
 _CLEAN = 1e-10  # smaller coefficients, relative to the scales, are rounding errors
-_SHOWN = 1e-6  # smaller coefficients are omitted in the expressions, not in K
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,14 +105,14 @@ def base_mapping(
 
 def _pivot(R: Array) -> tuple[Array, Array]:
     """Return the order in which columns are chosen, by norm, and the pivot of each, descending."""
-    shortened = R * (1.0 - _TIE * np.arange(R.shape[1]))  # the first of equal ones is chosen
+    shortened = R * (1.0 - TINY * np.arange(R.shape[1]))  # the first of equal ones is chosen
     triangle, order = scipy.linalg.qr(shortened, mode="r", pivoting=True)
     return order, np.abs(np.diag(triangle))
 
 
 def _expression(row: Array, names: tuple[str, ...], first: int) -> str:
     text = names[first]
-    for i in np.flatnonzero(np.abs(row) > _SHOWN):
+    for i in np.flatnonzero(np.abs(row) > TINY):
         if i != first:
             size = f"{abs(row[i]):.6g} ".removeprefix("1 ")
             text += f" {'-' if row[i] < 0 else '+'} {size}{names[i]}"
@@ -136,7 +133,8 @@ def structural_mapping(
         model.layout.names[:columns],
         scales=model.layout.scales(model.length)[:columns],
         preference=model.layout.preference()[:columns],
-        rtol=_CLOSED_RANK if model.loops else RANK_TOLERANCE,
+        # small motions of closed chains have pivots down to 1e-6
+        rtol=SINGULAR if model.loops else RANK_TOLERANCE,
     )
 
 
@@ -148,7 +146,7 @@ def _with_own_terms(model: RobotModel, plain: BaseMapping) -> BaseMapping:
     base = np.array(place)[plain.independent]
     W = random_regressor(model, 2 * len(names) // model.n_rows + 20, np.random.default_rng(0))
     Q, R = scipy.linalg.qr(W[:, base], mode="economic")
-    size = np.maximum(np.linalg.norm(W[:, own], axis=0), _FAINTEST)
+    size = np.maximum(np.linalg.norm(W[:, own], axis=0), LEAST_DIVISOR)
     T = Q.T @ W[:, own] / size
     S, order = scipy.linalg.qr(W[:, own] / size - Q @ T, mode="r", pivoting=True)
     rank = int(np.sum(np.abs(np.diag(S)) > RANK_TOLERANCE))

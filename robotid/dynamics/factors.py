@@ -27,7 +27,7 @@ ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
 
 _PART = 16384  # samples per part: merging costs little, and there are enough parts for threads
-_PANEL = 8  # columns eliminated at a time: measured fastest for 20 to 70 columns ...
+PANEL = 8  # columns eliminated at a time: measured fastest for 20 to 70 columns ...
 _WIDE, _WIDE_PANEL = 200, 24  # ... and from so many columns on, which exceed a cache
 _SHUFFLED = 8192  # samples in the buffer of the shuffle: all of a short log, 30 MB of a long one
 
@@ -380,7 +380,7 @@ class Triangle:
         """Initialise for rows of so many columns."""
         self.R = np.zeros((columns, columns), order="F")  # of all rows so far; read only
         self._is_empty = True
-        self._panel = _PANEL if columns < _WIDE else _WIDE_PANEL
+        self._panel = PANEL if columns < _WIDE else _WIDE_PANEL
         # 8 sizes of C's int: m, n, l, nb, lda, ldb, ldt, info; then T and work
         self._scratch = np.empty(4 + 2 * self._panel * columns)
         self._sizes = self._scratch[:4].view(np.intc)

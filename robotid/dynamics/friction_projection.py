@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from robotid.base.exceptions import DataError
+from robotid.base.tolerances import ROUNDING
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.dynamics.torque import drive_motion_along
@@ -28,7 +29,6 @@ _SIMPLE: dict[str, DriveTerm] = {
 }  # fmt: skip
 _STATES = (Presliding.label, LuGre.label)  # terms with an internal state
 _NEGLIGIBLE = 1e-4  # error of a projection over the torque of its drive
-_ROUNDING = 1e-12  # of the largest eigenvalue of products: a smaller one counts as 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class DriveMoments:
     def _root(self) -> Array:
         """Return M with M^T M the products, shape (k, k)."""
         values, vectors = np.linalg.eigh(self.products)
-        floor = _ROUNDING * max(float(values[-1]), 0.0)
+        floor = ROUNDING * max(float(values[-1]), 0.0)
         return np.asarray(np.sqrt(np.where(values > floor, values, 0.0))[:, None] * vectors.T)
 
     def rms(self, x: Mapping[str, float]) -> float:

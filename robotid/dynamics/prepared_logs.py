@@ -19,6 +19,7 @@ from scipy.special import expit
 from robotid.base.exceptions import DataError
 from robotid.base.findings import listed
 from robotid.base.text import seconds
+from robotid.base.tolerances import CONVERGED, LEAST_DIVISOR, NOISE_FREE
 from robotid.base.typing import Array
 from robotid.data.base_motion import BaseMotion
 from robotid.data.log import Log, Trajectory
@@ -120,8 +121,7 @@ _LOAD = 0.4  # of the mean force of all feet on the ground: initial limit of a c
 _SOME = 20  # samples without which a distribution is not estimated
 _ROUNDS = 10
 _WEIGHING = 3  # rounds in which the noise of each row is estimated, after that of groups of rows
-_SCORINGS, _SETTLED, _SAMPLES = 30, 1e-3, 500  # of the latter: rounds, change at their end, samples
-_TINY = 1e-12  # smallest variance
+_SCORINGS, _SAMPLES = 30, 500  # of the latter: rounds, samples
 _WIDER = 30.0  # prior of the forces there: it must not explain residuals
 _LEAST, _NEGLIGIBLE = 0.2, 1e-4  # smallest ratios of a variance to the one before, to the largest
 _SLOWEST = 1e-3  # [m/s] speed below which speeds do not differ
@@ -241,7 +241,8 @@ def _noise_of_groups(J: Array, b: Array, size: float) -> Array:
     J, b, weak = J[::step], b[::step], np.eye(J.shape[1]) / (_WIDER * size) ** 2
     group = np.repeat([0, 1, 2], [3, 3, n - 6])
     member = 1.0 * (group == np.unique(group)[:, None])  # (groups, n)
-    variance, largest = np.full(len(member), np.mean(b**2) + _TINY), np.mean(b**2, axis=0).max()
+    variance = np.full(len(member), np.mean(b**2) + LEAST_DIVISOR)
+    largest = np.mean(b**2, axis=0).max()
     for _ in range(_SCORINGS):
         inverse = 1.0 / (variance @ member)
         A = J * inverse
@@ -250,9 +251,9 @@ def _noise_of_groups(J: Array, b: Array, size: float) -> Array:
         left = member @ np.mean(np.einsum("kij,kj->ki", P, b) ** 2, axis=0)
         curvature = member @ np.mean(P**2, axis=0) @ member.T
         scored = np.linalg.lstsq(curvature, left, rcond=None)[0]  # contacts may explain a group
-        before, variance = variance, np.clip(scored, _LEAST * variance, largest + _TINY)
-        variance = np.maximum(variance, _NEGLIGIBLE * variance.max()) + _TINY
-        if np.abs(np.log(variance / before)).max() < _SETTLED:
+        before, variance = variance, np.clip(scored, _LEAST * variance, largest + LEAST_DIVISOR)
+        variance = np.maximum(variance, _NEGLIGIBLE * variance.max()) + LEAST_DIVISOR
+        if np.abs(np.log(variance / before)).max() < CONVERGED:
             break
     return np.asarray(np.sqrt(variance @ member))
 
@@ -302,7 +303,6 @@ _NEGLECTED = 0.02  # largest inertial torque that is neglected, over gravity's t
 _ROWS = 1000  # largest number of samples of a log that are used
 _PARTS = 8  # of the log, every other one fitted
 _BETTER = 0.85  # ratio of the errors below which the difference is significant
-_EXACT = 1e-6  # smallest relative error of a torque, for noise-free simulated logs
 _FEW = 3.0  # smallest number of rows per column for a joint
 _DEPENDENT = 1e-3  # relative singular value below which columns are dependent
 
@@ -402,5 +402,5 @@ def _held_out_error(model: RobotModel, motion: Trajectory, mask: Array, every: i
             size[size == 0] = 1.0
             theta = np.linalg.lstsq(A / size, known, rcond=_DEPENDENT)[0]
             squares += float(np.sum((unknown - B @ (theta / size)) ** 2))
-        error[j] = np.sqrt(squares) + _EXACT * np.linalg.norm(tau)
+        error[j] = np.sqrt(squares) + NOISE_FREE * np.linalg.norm(tau)
     return error

@@ -16,7 +16,10 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.settings import NOT_NEGATIVE, POSITIVE, Settings, is_number, require_kind, setting
 from robotid.base.typing import Array, real_numbers
+from robotid.data.base_motion import GAP_STEPS
 from robotid.data.log import Log, Trajectory
+from robotid.data.signals import GAP_CYCLES
+from robotid.diagnosis.decisions import BEYOND_NOISE
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import Sample
 from robotid.dynamics.rows import sure_rows
@@ -30,7 +33,6 @@ Instant = tuple[float, Array, Array, Array, Array]
 
 _ORDER = 4  # of the causal filter, even
 _SLOWEST = 1e-5  # smallest cut-off over the rate
-_GAP_CYCLES = 0.25  # longest pause without a gap [periods of the cut-off]
 _SETTLE = 4.0  # time after a start or a gap before the first instant [delays]
 
 
@@ -49,7 +51,7 @@ class LiveSignals:
             )
         self._step, self._n = 1.0 / rate, n
         self._is_continuous = np.asarray(is_continuous, dtype=bool)
-        self._gap = max(_GAP_CYCLES / cutoff, 2.5 / rate)
+        self._gap = max(GAP_CYCLES / cutoff, GAP_STEPS / rate)
         self._M = _bessel(_ORDER, cutoff, rate)  # [x; y]_k+1 = M [x; u]_k
         A, B, C = self._M[:-1, :-1], self._M[:-1, -1:], self._M[-1:, :-1]
         inverse = np.linalg.inv(np.eye(_ORDER) - A)
@@ -118,7 +120,7 @@ _MEMORY = 5.0  # time over which the noise level of each joint is averaged [s]
 _FIRST_NOISE = 0.1  # initial noise level, relative to the RMS torque of each row
 _SMALLEST_NOISE = 1e-4  # smallest noise level, relative to the RMS torque of each row
 _PSEUDO = 20.0  # weight of the initial noise level [samples]
-_CLIP = 9.0  # largest squared innovation in the noise level [variances]
+_CLIP = BEYOND_NOISE**2  # largest squared innovation in the noise level [variances]
 _CONVERGED = 0.25  # variance of the prediction over that of the noise, below which it has converged
 
 

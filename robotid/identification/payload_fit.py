@@ -14,12 +14,14 @@ from robotid.base.settings import is_number, require_each, require_kind
 from robotid.base.typing import Array
 from robotid.data.files.read import Readable
 from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.decisions import BEYOND_NOISE
 from robotid.diagnosis.verdict.scale_check import PayloadCheck
 from robotid.dynamics.factors import join
 from robotid.estimation.estimators import Consistent, Constraints, Estimate
 from robotid.estimation.estimators.estimator import quantile
 from robotid.estimation.estimators.two_runs import Compared, TwoRuns, payload_runs
 from robotid.estimation.fitting.estimator_settings import ConsistentSettings
+from robotid.estimation.fitting.fit import MOST_LOADS
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.identification.pipeline import in_memory, logs_of, robot_of, with_drives
 from robotid.robot.bodies import link_transfer, usual_links
@@ -30,11 +32,9 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import ParameterLayout
 from robotid.robot.prior import payload_spread, prior_spread
 
-_SIGNIFICANT = 3.0  # standard errors from which a mass differs from 0
 _DETERMINED = 0.3  # largest standard error of a determined mass or inertia, as a share of it
 _SMALL = 0.05  # ... of a determined centre of mass over the robot's length; a small mass over its
 _SAME = 1e-3  # of the largest column of a link: below, motion does not determine a parameter
-_MOST_LOADS = 20  # fits until the joint load torque is that of the identified bodies
 _CONVERGED = 1e-4  # relative change of the parameters at convergence
 _NONE = 1e-6  # weight of the prior in the fit that makes a payload consistent, and its least error
 _PACKED = ((0, 1, 3), (1, 2, 4), (3, 4, 5))  # places of a matrix among xx xy yy xz yz zz
@@ -188,7 +188,7 @@ def payload_of(model: RobotModel, link: str, x: Array, C: Array, freedom: Array)
             f"{moment:.2g} kg m^2 would have a standard error of {largest:.2g}; record fast motion "
             "of the joints next to it, about all axes"
         )
-    if error > 0 and mass < _SIGNIFICANT * error:
+    if error > 0 and mass < BEYOND_NOISE * error:
         words = f"the payload on {link} does not differ significantly from 0 kg"
         reasons = dict.fromkeys(("com", "inertia"), words)
     interval = np.array([mass - t * error, mass + t * error])
@@ -342,7 +342,7 @@ def fit_payloads(
     # the unknown bodies load the gears
     bodies, before = model.standard_parameters(), np.inf
     added = np.zeros_like(bodies)
-    for _ in range(_MOST_LOADS):
+    for _ in range(MOST_LOADS):
         ground, other = (
             run.with_model(run.model.with_reference(pi))
             for run, pi in ((reference, bodies), (loaded, bodies + added))
@@ -358,7 +358,7 @@ def fit_payloads(
             body, transfer = link_transfer(ground.model, payload.link)
             added[10 * body : 10 * body + 10] += transfer @ payload.parameters
     raise NotConvergedError(
-        f"the joint load torque has not converged after {_MOST_LOADS} fits; use friction = "
+        f"the joint load torque has not converged after {MOST_LOADS} fits; use friction = "
         "'viscous+coulomb', or record a richer motion",
         "max_iterations",
     )
@@ -475,7 +475,7 @@ def _check_mass(model: RobotModel, link: str, mass: float, error: float, is_know
             f"{error:.2g} kg; record poses and motions in which its gravity loads different "
             "joints, with and without the payload"
         )
-    if mass < -_SIGNIFICANT * error:
+    if mass < -BEYOND_NOISE * error:
         raise DataError(
             f"{link} carries {-mass:.3g} +- {error:.2g} kg less than in the reference: the "
             "reference contains the payload; swap the logs and the reference"

@@ -30,6 +30,7 @@ import numpy as np
 import scipy.linalg
 from scipy.optimize import minimize_scalar
 
+from robotid.base.tolerances import CONVERGED, TINY
 from robotid.base.typing import Array
 from robotid.data.base_motion import in_base
 from robotid.data.log import Trajectory
@@ -46,8 +47,7 @@ from robotid.robot.prior import prior_spread
 
 _LEAST, _MOST, _TRIED = 1e-6, 0.02, 40  # [m] bounds of s, values that are compared first
 _WIDER = 1e3  # factor of the prior standard deviations: wrong masses of a URDF are no offsets
-_RANK = 1e-6  # of the inertia of the whole robot: forces of all its axes are not always known
-_STEPS, _SETTLED = 20, 1e-3  # steps of noise level and s, relative change of s at their end
+_STEPS = 20  # of noise level and s
 
 
 def with_repeated_errors(recordings: Recordings) -> Recordings:
@@ -167,7 +167,7 @@ def estimated_errors(
         T = triangle_of(np.vstack([R * (np.sqrt(share) / sigma), prior]))
         found = scipy.linalg.solve_triangular(T[:-1, :-1], T[:-1, -1])
         sigma = float(np.linalg.norm(R[:, -1] - R[:, :-1] @ found) / np.sqrt(max(rows - b, 1)))
-        if abs(sigma - last) < _SETTLED * last:
+        if abs(sigma - last) < CONVERGED * last:
             break
     known, covariance = before.copy(), np.zeros((len(sizes), len(sizes)))
     inverse = scipy.linalg.solve_triangular(T[b:-1, b:-1], np.eye(len(R) - 1 - b))
@@ -187,7 +187,7 @@ def _largest(z2: Array, u2: Array) -> float:
     grid = np.linspace(np.log(_LEAST), np.log(_MOST), _TRIED)  # more than one minimum is possible
     k = int(np.argmin([loss(x) for x in grid]))
     near = grid[max(k - 1, 0)], grid[min(k + 1, _TRIED - 1)]
-    options = {"xatol": 0.1 * _SETTLED}
+    options = {"xatol": 0.1 * CONVERGED}
     return float(np.exp(minimize_scalar(loss, bounds=near, method="bounded", options=options).x))
 
 
@@ -242,7 +242,8 @@ def _shift_of_motion(model: RobotModel, mapping: BaseMapping, rows: Rows, theta:
         G = G.reshape(-1, model.n_rows, *G.shape[1:])
         residual = (root[:, 0] * (tau - W @ theta)).reshape(-1, model.n_rows)
         A = G @ theta  # (n, n_rows, 6), inertia of the whole robot
-        e = (np.linalg.pinv(A, rcond=_RANK) @ residual[..., None])[..., 0]
+        # singular if the forces of some of its axes are not known
+        e = (np.linalg.pinv(A, rcond=TINY) @ residual[..., None])[..., 0]
         E = np.einsum("nric,ni->nrc", G, e)
         shift += np.einsum("nrc,nr->c", E, E @ theta)
     return shift

@@ -6,17 +6,16 @@ from scipy.linalg import qr
 
 from robotid.base.exceptions import DataError, ModelError
 from robotid.base.findings import listed
+from robotid.base.tolerances import TINY
 from robotid.base.typing import Array
 from robotid.robot.constraints import frame_id
 from robotid.robot.model import RobotModel
 
-_CLOSED = 1e-6  # largest error of a closed loop, relative to the length of the robot
 _MOST = 30  # iterations of Newton's method
 # square root of the rounding error: the step with which Newton's method ends [rad, m], as the error
 # is about its square; and the share of the largest singular value below which loops are dependent
 _PRECISE = np.sqrt(np.finfo(float).eps)
-_REGULAR = 1e-6  # ... below which columns of a loop are dependent
-_DEAD = 1e-4  # ... and positions that loops determine, relative to the length of the robot
+_DEAD = 1e-4  # positions that loops determine, relative to the length of the robot
 _PATH = 25  # steps from the zero position to the first one
 _STEP = 0.25  # [rad, or robot lengths] standard deviation of a step of the random walk
 _APART = 4  # steps of the walk between two states
@@ -73,7 +72,7 @@ class Chains:
 
     def is_closed(self, x: Array) -> bool:
         """Return whether the loops close at coordinates to the accuracy of the computation."""
-        return bool(self.gaps(x[None]).max() <= _CLOSED * self._model.length)
+        return bool(self.gaps(x[None]).max() <= TINY * self._model.length)
 
     def random_states(self, samples: int, rng: np.random.Generator) -> tuple[Array, Array]:
         """Return random closed coordinates (N, n) of this assembly, projectors Z (N, n, n) on v."""
@@ -101,7 +100,7 @@ class Chains:
         for rows in [*groups, np.arange(len(J))]:
             R, columns = qr(J[rows], mode="r", pivoting=True)
             size = np.abs(np.diag(R))
-            columns = columns[: np.sum(size > _REGULAR * size[0])]
+            columns = columns[: np.sum(size > TINY * size[0])]
             chosen = qr(J[np.ix_(rows, columns)].T, mode="r", pivoting=True)[1]
             squares.append((rows[chosen[: len(columns)]], columns))
         return squares

@@ -15,6 +15,7 @@ import numpy as np
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed, toml_key
 from robotid.base.settings import is_number, require_kind
+from robotid.base.tolerances import LEAST_DIVISOR
 from robotid.base.typing import Array
 from robotid.robot.drive_term import (
     DataRange,
@@ -28,7 +29,6 @@ from robotid.robot.drive_term import (
 )
 from robotid.robot.tree import LARGEST
 
-_LEAST = 1e-12  # [rad/s or m/s] speed below which the slope of a power is constant
 _POSITIVE = (1.0 / LARGEST, LARGEST)  # bounds of shape parameters that are divisors
 #: Value of ``friction`` with which the families of each joint are chosen.
 AUTO = "auto"
@@ -176,7 +176,7 @@ class Power(MemorylessTerm):
     @staticmethod
     def speed_law(w: Array, exponent: float) -> Slope:
         y = np.abs(w) ** exponent
-        return y, np.sign(w) * exponent * y / np.maximum(np.abs(w), _LEAST)
+        return y, np.sign(w) * exponent * y / np.maximum(np.abs(w), LEAST_DIVISOR)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ import pinocchio as pin
 from robotid.base.exceptions import DataError, ModelError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.settings import LARGEST_SETTING, require_each, require_flag, require_kind
+from robotid.base.tolerances import TINY
 from robotid.base.typing import Array, frozen, real_numbers
 from robotid.robot.constraints import Constraint, Contact, Loop, check_constraints
 from robotid.robot.drive_term import DriveMotion, DriveTerm
@@ -31,7 +32,6 @@ from robotid.robot.tree import (
 
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
 _STRONGEST = 100.0  # [m/s^2] with more, accelerations are negligible beside gravity
-_UNIT = 1e-6  # tolerance of the norm of a quaternion
 
 
 @dataclass(frozen=True, eq=False)
@@ -346,7 +346,7 @@ class RobotModel:
             )
         if self.free_flyer:
             sizes = np.linalg.norm(q[:, 3:7], axis=1)
-            for row in np.flatnonzero(np.abs(sizes - 1.0) > _UNIT).tolist():
+            for row in np.flatnonzero(np.abs(sizes - 1.0) > TINY).tolist():
                 raise DataError(
                     f"q[{row}, 3:7], the quaternion of the base, has length {sizes[row]:g}, wanted "
                     "1, in the order qx qy qz qw"

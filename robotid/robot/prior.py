@@ -7,6 +7,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from robotid.base.tolerances import SLACK
 from robotid.base.typing import Array
 from robotid.robot.bodies import (
     BEYOND_FRAMES,
@@ -33,7 +34,6 @@ REASONS = MappingProxyType({
     "inertial_units": "masses or lengths in another unit than kg and m",
 })  # fmt: skip
 _DENSITY = 1000.0  # [kg/m^3] without a body to take it from
-_SLACK = 1e-9  # relative violation of positive definiteness that is rounding
 _COPIES = 3  # identical isotropic inertials are placeholders
 # medians over the bodies of all robots in example-robot-data: at most 2e4 kg/m^3 and 7
 _DENSEST = 5e4  # [kg/m^3] over the box of a body's frames; with masses in g 1e5 and more
@@ -153,7 +153,7 @@ def _reasons(model: RobotModel, J: Array, sides: dict[str, Array]) -> dict[str, 
     scale = np.trace(J, axis1=1, axis2=2)
     codes = dict.fromkeys(bodies, "")
     codes |= {body: "default_inertial" for body in _placeholders(model)}
-    is_impossible, has_mass = least < -_SLACK * scale, mass > 0
+    is_impossible, has_mass = least < -SLACK * scale, mass > 0
     codes |= dict.fromkeys(compress(bodies, is_impossible), "not_positive_definite")
     codes |= dict.fromkeys(compress(bodies, ~has_mass), "missing_inertial")
     sized = [k for k, body in enumerate(bodies) if mass[k] > 0 and body in sides]

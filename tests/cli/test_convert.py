@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.recorders import JOINT_STATE, messages_of, write_bag2
+from helpers.recorders import JOINT_STATE, messages_of, write_states
 
 from robotid.base.exceptions import DataError
 from robotid.base.files import write_text
@@ -30,7 +30,7 @@ def bag(tmp_path, log):
     """A bag whose second topic is another arm's."""
     other = replace(log, joints=("left", "right"))
     topics = {"/arm": messages_of(log), "/other": messages_of(other)}
-    return write_bag2(tmp_path / "bag", topics)
+    return write_states(tmp_path / "bag", topics)
 
 
 def assert_same(back, log):

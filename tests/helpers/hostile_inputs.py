@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 
 from helpers.hostile_urdfs import any_of, run_urdf, urdf_inputs
 from helpers.paths import URDF as URDF_FOLDER
-from helpers.recorders import messages_of, write_bag1, write_bag2, write_mcap
+from helpers.recorders import messages_of, write_mcap, write_states
 from helpers.synthetic import exact_log, truth
 from robotid.cli import main
 from robotid.cli.job import Job
@@ -120,9 +120,9 @@ def good_file(name):
         if name == "log.mcap":
             write_mcap(path, messages_of(log))
         elif name == "log.bag":
-            write_bag1(path, messages_of(log))
+            write_states(path, {"/joint_states": messages_of(log)})
         elif name == "log.db3":
-            write_bag2(path.with_suffix(""), {"/joint_states": messages_of(log)})
+            write_states(path.with_suffix(""), {"/joint_states": messages_of(log)})
             path = next(path.with_suffix("").glob("*.db3"))
         elif name.startswith("plain"):
             READERS[path.suffix](table, path)

@@ -44,13 +44,6 @@ def number(value, spec=".4g"):
     return format(value, spec).replace("-", "−")
 
 
-def percent(value):
-    """Return a percentage as a page writes it."""
-    if value is None or not math.isfinite(value):
-        return "–"
-    return number(value, ".0f" if value >= 1000 else ".1f" if value >= 1 else ".2f")
-
-
 def charts(html):
     """Return the data of a page's charts, decoded: what charts.js draws."""
     found = []
@@ -80,13 +73,3 @@ def numbers_of(packed):
     values = np.array(packed["low"]) + np.array(packed["step"]) * codes
     values = np.where(codes == np.iinfo(codes.dtype).max, np.nan, values)
     return 10.0**values if packed.get("log") else values
-
-
-def bars(html):
-    """Return by joint, in order, where its bar ends and where each mark stands [%]."""
-    found = {}
-    for row in lxml.html.fromstring(html).xpath("//li[a and .//rect[@y='4']]"):
-        [width] = row.xpath(".//rect[@y='4']/@width")
-        marks = [float(x.rstrip("%")) for x in row.xpath(".//svg/@x") if x.endswith("%")]
-        found[row.find("a").text_content()] = (float(width.rstrip("%")), marks)
-    return found

@@ -45,32 +45,34 @@ def joint_state(types, stamp, names, position, velocity, effort):
     return types.types[JOINT_STATE](header, list(names), *arrays)
 
 
-def write_bag2(path, topics, *, plugin=StoragePlugin.SQLITE3, delay=0.0, others=()):
-    """Write {topic: messages} as a folder; others are topics of text, one message each."""
-    types = get_typestore(Stores.ROS2_HUMBLE)
-    with Bag2Writer(path, version=9, storage_plugin=plugin) as bag:
-        for topic in others:
-            text = bag.add_connection(topic, "std_msgs/msg/String", typestore=types)
-            message = types.types["std_msgs/msg/String"]("hello")
-            bag.write(text, 5, types.serialize_cdr(message, "std_msgs/msg/String"))
-        for topic, messages in topics.items():
-            connection = bag.add_connection(topic, JOINT_STATE, typestore=types)
-            for message in messages:
-                state = joint_state(types, to_ns(message[0]), *message[1:])
-                raw = types.serialize_cdr(state, JOINT_STATE)
-                bag.write(connection, to_ns(message[0] + delay), raw)
+def write_bag(path, topics, types, plugin=StoragePlugin.SQLITE3):
+    """Write {topic: (type, messages with the time of recording [s])} as .bag, or as a folder."""
+    is_ros1 = path.suffix == ".bag"
+    serialize = types.serialize_ros1 if is_ros1 else types.serialize_cdr
+    folder = {"version": 9, "storage_plugin": plugin}
+    with Bag1Writer(path) if is_ros1 else Bag2Writer(path, **folder) as bag:
+        for topic, (kind, messages) in topics.items():
+            connection = bag.add_connection(topic, kind, typestore=types)
+            for t, message in messages:
+                bag.write(connection, to_ns(t), serialize(message, kind))
     return path
 
 
-def write_bag1(path, messages, topic="/joint_states"):
-    types = get_typestore(Stores.ROS1_NOETIC)
-    with Bag1Writer(path) as bag:
-        connection = bag.add_connection(topic, JOINT_STATE, typestore=types)
-        for message in messages:
-            state = joint_state(types, to_ns(message[0]), *message[1:])
-            raw = types.serialize_ros1(state, JOINT_STATE)
-            bag.write(connection, to_ns(message[0]), raw)
-    return path
+def states_of(types, messages, delay=0.0):
+    """Return joint states as ``write_bag`` takes them; delay of the time of recording [s]."""
+    return JOINT_STATE, [(m[0] + delay, joint_state(types, to_ns(m[0]), *m[1:])) for m in messages]
+
+
+def types_of(path):
+    return get_typestore(Stores.ROS1_NOETIC if path.suffix == ".bag" else Stores.ROS2_HUMBLE)
+
+
+def write_states(path, topics, *, delay=0.0, others=(), **how):
+    """Write {topic: joint states}; others are topics of text, one message each."""
+    types, text = types_of(path), "std_msgs/msg/String"
+    written = {topic: (text, [(5e-9, types.types[text]("hello"))]) for topic in others}
+    written |= {topic: states_of(types, messages, delay) for topic, messages in topics.items()}
+    return write_bag(path, written, types, **how)
 
 
 def write_mcap(path, messages, topic="/joint_states", delay=lambda k: 0.0):
@@ -116,9 +118,9 @@ POINT = "trajectory_msgs/msg/JointTrajectoryPoint"
 POINTS = {"old": ("actual", "desired", None), "new": ("feedback", "reference", "output")}
 
 
-def controller_types(era, store):
+def controller_types(era, path):
     """Return a store that knows the controller's state as control_msgs of an era defines it."""
-    types = get_typestore(store)
+    types = types_of(path)
     lines = ["std_msgs/Header header", "string[] joint_names"]
     lines += [f"trajectory_msgs/JointTrajectoryPoint {name}" for name in POINTS[era] if name]
     lines += ["trajectory_msgs/JointTrajectoryPoint error"]
@@ -149,26 +151,16 @@ def controller_state(types, era, log, k, *, output=None):
 
 def write_controller(path, log, era, *, states=(), output=None, plugin=StoragePlugin.MCAP):
     """Write a controller's states as .bag, or as a folder; and joint states."""
-    is_ros1 = path.suffix == ".bag"
-    types = controller_types(era, Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
-    folder = {"version": 9, "storage_plugin": plugin}
-    serialize = types.serialize_ros1 if is_ros1 else types.serialize_cdr
-    with Bag1Writer(path) if is_ros1 else Bag2Writer(path, **folder) as bag:
-        connection = bag.add_connection("/arm_controller/state", CONTROLLER, typestore=types)
-        for k, t in enumerate(log.t):
-            message = controller_state(types, era, log, k, output=output)
-            bag.write(connection, to_ns(t), serialize(message, CONTROLLER))
-        if states:
-            other = bag.add_connection("/joint_states", JOINT_STATE, typestore=types)
-            for message in states:
-                state = joint_state(types, to_ns(message[0]), *message[1:])
-                bag.write(other, to_ns(message[0]), serialize(state, JOINT_STATE))
-    return path
+    types = controller_types(era, path)
+    rows = [(t, controller_state(types, era, log, k, output=output)) for k, t in enumerate(log.t)]
+    topics = {"/arm_controller/state": (CONTROLLER, rows)}
+    topics |= {"/joint_states": states_of(types, states)} if states else {}
+    return write_bag(path, topics, types, plugin)
 
 
 def write_idl_controller(path, log):
     """Write a controller's states as an MCAP whose types are defined in IDL."""
-    types = controller_types("new", Stores.ROS2_HUMBLE)
+    types = controller_types("new", path)
     points = "".join(
         f"      trajectory_msgs::msg::JointTrajectoryPoint {x};\n" for x in POINTS["new"]
     )

@@ -231,6 +231,7 @@ def page_content(html):
         href = element.get("href", "")
         told = [element.get(key) for key in ("aria-label", "title", "style")]
         told.insert(2, "" if href.startswith("#") else href)
+        told += ["open"] * ("open" in element.attrib)
         words = [f"[{word}]" for word in told if word]
         words += ["|"] * (element.tag in ("td", "th"))
         if element.tag in ("tr", "div", "td") and element.get("class"):

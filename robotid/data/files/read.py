@@ -52,7 +52,7 @@ from robotid.data.signal_settings import (
     Transmission,
     check_transmissions,
 )
-from robotid.data.units import check_units, turned
+from robotid.data.units import STILL, check_units, turned
 from robotid.robot.tree import Joint
 
 #: A log, or a file or a DataFrame with the columns of a log.
@@ -67,7 +67,6 @@ _SI = LogUnits()
 _WHOLE = LogSource()
 _SPARSE = 0.02  # share of rows without a value from which a column has another rate
 _BASE = BaseColumns()
-_STILL = 0.02  # range of the position of a joint at rest [rad or m]
 
 
 def read_log(
@@ -397,7 +396,7 @@ def _moves(
 ) -> bool:
     """Return whether the position of a joint changes in its column."""
     _, scale = units.scale(joint, is_angle=joint not in prismatic)
-    return bool(scale * np.ptp(table.read([column])[column]) > _STILL)
+    return bool(scale * np.ptp(table.read([column])[column]) > STILL)
 
 
 def _notes_of_sensors(

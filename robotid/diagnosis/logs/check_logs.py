@@ -16,6 +16,7 @@ from robotid.base.findings import Finding, by_severity, toml_key
 from robotid.base.typing import Array
 from robotid.data.log import REPEATED, Log, Trajectory, repeated_share
 from robotid.data.signal_settings import LogUnits, SignalSettings
+from robotid.data.units import STILL
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.logs import channels
 from robotid.diagnosis.logs.base_checks import check_base
@@ -168,9 +169,9 @@ def check_locked(
     for joint, q in positions.items():
         stated = model.locked[joint]
         middle, extent = float(np.median(q)), float(np.ptp(q))
-        if extent <= channels.STILL and abs(middle - stated) <= channels.STILL:
+        if extent <= STILL and abs(middle - stated) <= STILL:
             continue
-        what = "moves" if extent > channels.STILL else "stands"
+        what = "moves" if extent > STILL else "stands"
         yield finding(
             "locked_position", log, joint, what=what, todo=what, default=joint in asked,
             unit="m" if types[joint] == "prismatic" else "rad", stated=stated, median=middle,

@@ -15,8 +15,9 @@ from functools import partial
 
 import numpy as np
 
+from robotid.base.tolerances import TINY
 from robotid.base.typing import Array
-from robotid.diagnosis.decisions import GROWN, ROUNDING, STEP, TINY
+from robotid.diagnosis.decisions import GROWN, ROUNDING, STEP
 from robotid.diagnosis.residual.misfit import Misfit
 from robotid.diagnosis.residual.term_trials import RIDGE, Sample, Trial, Trials, take_sample
 from robotid.dynamics.torque import drive_motion_along

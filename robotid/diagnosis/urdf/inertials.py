@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from robotid.base.findings import Finding, listed
+from robotid.base.tolerances import SLACK
 from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import AGREES, ROUNDING
@@ -29,7 +30,6 @@ _SLENDER = 1.6  # ellipsoid over the length that the kinematics give; a uniform 
 _THIN = 0.01  # [m] least side of a box, so that thin sheets have a volume
 _SMALL = 1e-3  # share of the robot's mass below which a fault of a body is only a note
 _ROUND = tuple(10.0**k for k in range(-6, 3))  # inertias [kg m^2] and masses [kg] of templates
-_ALIKE = 1e-9  # relative difference of copied inertials, and of a sum of moments, by rounding
 
 
 def negative_masses(robot: ET.Element) -> Iterator[Finding]:
@@ -91,9 +91,9 @@ def impossible_inertial(link: str, inertial: Inertial, matters: bool) -> Iterato
     A, B, C = np.linalg.eigvalsh([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]).tolist()
     margin = A + B - C
     faults = {
-        "negative": min(A, 0.0) < -_ALIKE * abs(C),
-        "triangle": margin < -_ALIKE * abs(C),
-        "flat": margin <= _ALIKE * abs(C),
+        "negative": min(A, 0.0) < -SLACK * abs(C),
+        "triangle": margin < -SLACK * abs(C),
+        "flat": margin <= SLACK * abs(C),
     }
     what = next((key for key, holds in faults.items() if holds), "")
     if what and (inertial.mass != 0 or any(inertial.inertia)):
@@ -272,7 +272,7 @@ def _templates(model: RobotModel) -> Iterator[Finding]:
     for link, inertial in model.tree.inertials.items():
         ixx, ixy, ixz, iyy, iyz, izz = inertial.inertia
         is_isotropic = ixx == iyy == izz and ixy == ixz == iyz == 0
-        if not (is_isotropic and np.isclose(ixx, _ROUND, rtol=_ALIKE).any()):
+        if not (is_isotropic and np.isclose(ixx, _ROUND, rtol=SLACK).any()):
             continue
         if inertial.mass in (*_ROUND, 0.5) or not np.any(inertial.com):
             yield finding(
@@ -288,7 +288,7 @@ def _copies(model: RobotModel, points: dict[str, Array]) -> Iterator[Finding]:
     values = {link: [x.mass, *x.com, *x.inertia] for link, x in inertials.items() if link in points}
     for link in (body for body in model.layout.bodies if body in values):
         for group in groups:
-            if np.allclose(values[link], values[group[0]], rtol=_ALIKE, atol=1e-12):
+            if np.allclose(values[link], values[group[0]], rtol=SLACK, atol=1e-12):
                 group.append(link)
                 break
         else:

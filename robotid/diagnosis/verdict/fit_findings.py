@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from robotid.base.findings import Finding, listed
+from robotid.base.tolerances import TINY
 from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import DIFFERS, NO_ERROR_OF_MASSES, SHARE_OF_ROWS, TENFOLD, TINY
+from robotid.diagnosis.decisions import DIFFERS, NO_ERROR_OF_MASSES, SHARE_OF_ROWS, TENFOLD
 from robotid.diagnosis.residual.misfit import Misfit, misfit_finding
 from robotid.diagnosis.urdf.inertials import audit_bodies
 from robotid.diagnosis.verdict.parameter_table import correlated_parameters
@@ -19,7 +20,7 @@ from robotid.diagnosis.verdict.scale_check import friction_shares
 from robotid.diagnosis.verdict.verdict import BEATEN, GOOD, NAMED, SMALL, error_of, is_harmless_cost
 from robotid.estimation.estimators.consistent_fit import slabs
 from robotid.estimation.fitting.estimator_settings import BoundedSettings, ConsistentSettings
-from robotid.estimation.fitting.fitted import Fit
+from robotid.estimation.fitting.fitted import CLEARLY, Fit
 from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.estimation.variation.variation import UnlikeRun, Variation
 from robotid.robot.bodies import (
@@ -35,17 +36,15 @@ from robotid.robot.parameters import pseudo_inertia
 
 _BIASED = 0.5, 2.0  # shift of a parameter by encoder noise, in standard errors: note, warning
 _COARSE = 0.1  # share of encoder noise over the largest one, from which a joint is named
-_DIFFERS = 1.2  # residual of a consistent fit over that of WLS above which it is reported
-# Of the URDF's smallest eigenvalue: below, a body is barely possible, if links on locked joints
-# have more than this share of its mass.
-_SHRUNK, _MUCH = 0.1, 0.2
+_SHRUNK = 0.1  # of the URDF's smallest eigenvalue: below, a body is barely possible ...
+_MUCH = 0.2  # ... if links on locked joints have more than this share of its mass
 _USER_BOUNDS = ("mass ", "total_mass ", "centre_of_mass ")
 _DENSEST = 12_000.0  # [kg/m^3] of a link: lead has 11,340
 _UNLIKELY = 0.05  # share of the bodies that the errors allow below which one is not possible
 _AT_BOUND = 1e-3  # relative difference of a mass from a stated bound that determines it
 _VANISHED = 0.05  # share of a link's URDF mass below which the link has practically vanished
-# Of the squared error, that a gain of the torque leaves; of friction, which may have changed, too.
-_LEFT, _MOSTLY = 1 / 3, 0.6
+_LEFT = 1 / 3  # largest share of the squared error that a gain of the torque leaves
+_MOSTLY = 0.6  # share of friction in a torque above which friction may have changed, too
 
 
 def fit_findings(
@@ -95,7 +94,7 @@ def _costs(fit: Fit) -> Iterator[Finding]:
         asked = f"the constraints in [estimator] ({keys}), "
     for joint, measured in fit.metrics().per_joint.items():
         free = wls[joint]
-        if measured.rmse <= _DIFFERS * free.rmse:
+        if measured.rmse <= CLEARLY * free.rmse:
             continue
         error, least = measured.relative_error_pct, free.relative_error_pct or 0.0
         is_little = error is not None and error**2 - least**2 < SMALL**2

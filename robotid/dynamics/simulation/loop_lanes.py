@@ -28,6 +28,7 @@ from typing import NamedTuple
 import numpy as np
 
 from robotid.base.exceptions import SettingsError
+from robotid.base.tolerances import ROUNDING
 from robotid.base.typing import Array
 from robotid.dynamics.kernels.lanes import (
     LANES,
@@ -64,7 +65,6 @@ from robotid.robot.drives import Bristles
 
 THETA = 0.5  # instant of the forces, relative to the step: exact to second order
 _NEWTON = 60  # largest number of steps; three or four are typical
-_CLOSE = 1e-12  # of the speed, relative to 1 + its size
 _MOVED_BEFORE = 0.1  # assumed time of motion before the simulation, for initial deflections [s]
 _SIGN = 1e-5  # speed over which friction reverses [rad/s or m/s]
 
@@ -257,7 +257,7 @@ def _newton(work, at, robot, step, now, is_cautious):
             after = before - share * get(work, at.G + i)
             halts = after * before < 0.0  # at speed 0, where friction is nonlinear
             after = where(halts, 0.0, after)
-            is_close = abs(after - before) <= _CLOSE * (1.0 + abs(after))
+            is_close = abs(after - before) <= ROUNDING * (1.0 + abs(after))
             is_found = is_found and not is_any(halts | ~is_close)
             put(work, at.u + i, after)
         if is_found:  # H changes by rounding only

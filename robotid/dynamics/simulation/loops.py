@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 Column: TypeAlias = tuple[int, int, int]
 
 _KINDS = ("armature", "kp", "kd", "limit", "term", "delay", "zero", "body", "start", "speed")
-_GAP = 3.0  # step in time above which a segment ends [median steps]
+LOOP_GAP = 3.0  # step in time above which a segment ends [median steps]
 _AROUND = 0.03  # half-width of the fit for the initial speed [s]
 _FEWEST = 2  # smallest number of samples on each side of that fit
 _SHORT = 0.5  # smallest last window; a shorter one is part of the previous one [windows]
@@ -130,7 +130,7 @@ def cut_windows(log: Log, length: float, lead: float) -> tuple[Window, ...]:
     """Return the windows of a log, segment by segment between its gaps."""
     steps = np.diff(log.t)
     dt = float(np.median(steps))
-    edges = [0, *(np.flatnonzero(steps > _GAP * dt) + 1), len(log.t)]
+    edges = [0, *(np.flatnonzero(steps > LOOP_GAP * dt) + 1), len(log.t)]
     ahead = round(lead / dt)
     windows = []
     for start, stop in pairwise(edges):

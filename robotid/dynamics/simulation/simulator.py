@@ -9,6 +9,7 @@ import pinocchio as pin
 
 from robotid.base.exceptions import DataError, ModelError, NotConvergedError, SettingsError
 from robotid.base.findings import listed, suggestion
+from robotid.base.tolerances import ROUNDING, SLACK
 from robotid.base.typing import Array, ProgressCallback, ignore_progress
 from robotid.data.log import Log, Trajectory
 from robotid.dynamics.simulation.motions import Motion
@@ -40,10 +41,8 @@ _TICK = 1e-6  # smallest step between time stamps [s]
 _CHUNK = 1024  # number of steps for which a motion is evaluated together
 _LEAST_INERTIA = 0.02  # smallest inertia in the computation of PD gains [kg m^2 or kg]
 _ITERATIONS = 200  # of the fixed point of load and load-dependent friction
-_SETTLED = 1e-12  # relative change of the load at convergence
 _SIGN_SPEED = 2e-4  # speed over which the plant's Coulomb friction reverses [rad/s or m/s]
 _TYPICAL_EFFORT = 50.0  # effort limit of a drive with typical parameters [N m or N]
-_IMPOSSIBLE = -1e-9  # smallest eigenvalue of a body's pseudo-inertia over the largest
 
 # ROS34PW2, a Rosenbrock W-method: order 3 for any Jacobian approximation, L-stable, stable with
 # stiction (Rang, Angermann 2005, New Rosenbrock W-methods)
@@ -358,7 +357,7 @@ class RobotPlant:
             return a
         for _ in range(_ITERATIONS):
             before, load = load, bare - slope @ np.abs(load)
-            if np.abs(load - before).max() <= _SETTLED * (1.0 + np.abs(load).max()):
+            if np.abs(load - before).max() <= ROUNDING * (1.0 + np.abs(load).max()):
                 return np.asarray(a - per_load @ np.abs(load))
         raise NotConvergedError(
             f"load-dependent friction does not converge in {_ITERATIONS} steps: its parameters are "
@@ -682,7 +681,7 @@ def perturbed_bodies(model: RobotModel, size: float, rng: np.random.Generator) -
     perturbed = []
     for name, J in zip(model.layout.bodies, pseudo_inertia(bodies), strict=True):
         values, axes = np.linalg.eigh(J)
-        if values[0] < _IMPOSSIBLE * max(values[-1], 0.0) or values[-1] < 0:
+        if values[0] < -SLACK * max(values[-1], 0.0) or values[-1] < 0:
             raise ModelError(
                 f"body {name!r} of the URDF is physically inconsistent: the smallest eigenvalue of "
                 f"its pseudo-inertia is {values[0]:.3g}, wanted 0 or more. Correct its inertial "
@@ -720,7 +719,7 @@ def _check(model: RobotModel, pi: Array) -> None:
     bodies = pseudo_inertia(pi[: layout.n_inertial])
     for name, J in zip(layout.bodies, bodies, strict=True):
         values = np.linalg.eigvalsh(J)
-        if values[0] < _IMPOSSIBLE * max(values[-1], 0.0):
+        if values[0] < -SLACK * max(values[-1], 0.0):
             raise SettingsError(
                 f"truth: body {name!r} is physically inconsistent: the smallest eigenvalue of its "
                 f"pseudo-inertia is {values[0]:.3g}, wanted 0 or more. State other values, or "

@@ -7,6 +7,7 @@ import numpy as np
 import scipy.linalg
 
 from robotid.base.exceptions import DataError, NotConvergedError, RankDeficientError
+from robotid.base.tolerances import ROUNDING, TINY
 from robotid.base.typing import Array
 from robotid.dynamics.factors import Factors
 from robotid.estimation.estimators.estimator import (
@@ -20,13 +21,11 @@ from robotid.estimation.estimators.estimator import (
 _RANK = 1e-7  # relative singular value below which the rank is reduced, columns of unit norm
 SILENT = 1e-6  # relative norm below which a column has no information
 _OPEN = 1e-2  # share in undetermined directions above which a parameter is undetermined
-_FLOOR = 1e-9  # smallest noise level over the torque, for noise-free data
+LEAST_NOISE = 1e-9  # smallest noise level over the torque, for noise-free data
 _TOLERANCE = 1e-8  # relative change of the noise levels at which WLS has converged
 _MAX_ITERATIONS = 200
 _SETTLED = 1e-5  # relative change that is sufficient after the largest number of iterations
 _TLS_NOISE = 0.01  # [-] of the regressor's columns
-_TLS_TOLERANCE = 1e-12  # change of the torque relative to its norm
-_ALONE = 1e-6  # relative gap of the two smallest singular values below which they are equal
 
 
 @dataclass(frozen=True)
@@ -140,7 +139,7 @@ class TLS(BatchEstimator):
                 )
             before, theta = theta, mixed_tls(R, noise / np.sqrt(1.0 - share))
             change = np.linalg.norm(R[:, :-1] @ (theta - before)) / np.linalg.norm(R[:, -1])
-            if change < _TLS_TOLERANCE:
+            if change < ROUNDING:
                 return theta, share
         raise NotConvergedError(
             f"total least squares has not converged after {_MAX_ITERATIONS} steps; reduce "
@@ -208,7 +207,7 @@ def _noise(factors: Factors, theta: Array, used: Array) -> Array:
     """Return each joint's noise level, (n,) [N m or N]: ``used`` is the leverage of its rows."""
     sigma = factors.noise_levels(theta, np.maximum(factors.rows - used, 1.0))
     torque = np.sqrt(factors.torque_squares() / np.maximum(factors.rows, 1))
-    floor = _FLOOR * np.where(torque > 0, torque, 1.0)
+    floor = LEAST_NOISE * np.where(torque > 0, torque, 1.0)
     return np.asarray(np.maximum(sigma, floor))
 
 
@@ -224,8 +223,8 @@ def mixed_tls(rows: Array, noise: Array) -> Array:
     k = len(exact)
     s, Vt = np.linalg.svd(triangle[k:, k:])[1:]
     v = Vt[-1]
-    is_alone = len(s) == 1 or s[-2] - s[-1] > _ALONE * s[0]
-    if not is_alone or abs(v[-1]) < _ALONE:
+    is_alone = len(s) == 1 or s[-2] - s[-1] > TINY * s[0]
+    if not is_alone or abs(v[-1]) < TINY:
         raise DataError(
             "the solution of total least squares is not unique: the smallest singular values are "
             f"{s[-2:].tolist()}, wanted one clearly below the other; record a motion with more "

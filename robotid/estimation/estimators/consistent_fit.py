@@ -10,6 +10,7 @@ import scipy.linalg
 
 from robotid.base.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.base.findings import listed
+from robotid.base.tolerances import NOISE_FREE, SLACK
 from robotid.base.typing import Array
 from robotid.dynamics.factors import Factors, Triangle, merge
 from robotid.estimation.estimators.batch import WLS, solve_factor
@@ -30,9 +31,7 @@ from robotid.estimation.estimators.interior_point import (
 )
 from robotid.robot.parameters import ParameterLayout, pseudo_inertia, pseudo_inertia_basis
 
-_FLOOR = 1e-6  # smallest noise level over the torque, for noise-free data
 _ACTIVE = 1e-5  # slack below which a constraint is active, dimensionless
-_ROUNDING = 1e-9  # of drives over their scale above 0, and of pinned bodies within bounds [kg], [m]
 _OPEN = (0.0, np.inf)  # [kg]
 
 _SMALLEST, _LARGEST = -4.0, 2.0  # decades of the weights tried
@@ -88,7 +87,7 @@ class Constraints:
         p = len(layout.names)
         signs = np.flatnonzero(layout.is_nonnegative())
         labels = [f"drive_signs {layout.names[i]}" for i in signs]
-        G, h = [np.eye(p)[signs]], [np.full(len(signs), -_ROUNDING)]
+        G, h = [np.eye(p)[signs]], [np.full(len(signs), -SLACK)]
         for row, constant, label in self._ranges(layout):
             norm = np.linalg.norm(row * scale)
             G.append((row * scale / norm)[None])
@@ -141,7 +140,7 @@ class Constraints:
                 "correct it, or remove the link from 'pinned'"
             )
         low, high = self.mass.get(body, _OPEN)
-        if not low - _ROUNDING <= values[0] <= high + _ROUNDING:
+        if not low - SLACK <= values[0] <= high + SLACK:
             raise SettingsError(
                 f"{body} is pinned at the URDF's {values[0]:g} kg, outside its bounds "
                 f"[{low:g}, {high:g}] kg; remove the link from 'pinned' or from 'mass'"
@@ -150,7 +149,7 @@ class Constraints:
             A, b = self.com[body]
             centre = values[1:4] / values[0]
             beyond = float((A @ centre - b).max())
-            if beyond > _ROUNDING:
+            if beyond > SLACK:
                 raise SettingsError(
                     f"{body} is pinned, but the URDF's centre of mass "
                     f"{np.round(centre, 4).tolist()} m is {1e3 * beyond:.1f} mm outside its "
@@ -165,7 +164,7 @@ class Constraints:
             for body, mass in masses.items()
         ]
         least, most = np.sum(bounds, axis=0)
-        if high < least - _ROUNDING or low > most + _ROUNDING:
+        if high < least - SLACK or low > most + SLACK:
             raise SettingsError(
                 f"total_mass is bounded by [{low:g}, {high:g}] kg, but the bounds of the bodies "
                 f"and pinned masses allow [{least:g}, {most:g}] kg; correct the bounds"
@@ -281,7 +280,7 @@ class Consistent(BatchEstimator):
         used = factors.leverages(solve_factor(factors, sigma, prior).covariance) / sigma**2
         freedom = np.maximum(rows - used / self.independent_share, LEAST_FREEDOM * rows)
         torque = np.sqrt(factors.torque_squares() / rows)
-        least = _FLOOR * np.where(torque > 0, torque, 1.0)
+        least = NOISE_FREE * np.where(torque > 0, torque, 1.0)
         level = sigma * np.sqrt(np.maximum(rows - used, 1.0) / freedom)
         return np.asarray(np.maximum(level, least))
 

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.special
 
 from robotid.base.exceptions import DataError
+from robotid.base.tolerances import ROUNDING
 from robotid.base.typing import Array
 from robotid.dynamics.factors import Factors, Problem, compress
 
@@ -19,7 +20,10 @@ DataT = TypeVar("DataT", contravariant=True)
 Weighing: TypeAlias = Literal["alike", "by joint", "by age", "by step"]
 
 FEWEST_SEGMENTS = 12  # smallest number of segments for an estimate of the scatter
-ROUNDING = 1e-12  # relative size of rounding errors
+#: Segments of all logs together for it: few enough that each is longer than the time for which an
+#: encoder stays at one step while a joint reverses.
+SEGMENTS = 48
+WEAK_PRIOR = 10.0  # factor on the typical or prior spread, with which a prior hardly has an effect
 ALIKE = 2.0  # standard errors within which values are equal
 LEAST_FREEDOM = 0.1  # smallest degrees of freedom of a noise level, as a share of the rows
 MOST_EXPLAINED = 0.5  # largest share of a squared residual that an assumed error explains

@@ -22,8 +22,8 @@ import numpy as np
 import scipy.linalg
 
 from robotid.base.exceptions import NotConvergedError
+from robotid.base.tolerances import ROUNDING
 from robotid.base.typing import Array
-from robotid.estimation.estimators.estimator import ROUNDING
 from robotid.robot.parameters import (
     ParameterLayout,
     inertial_from_pseudo_inertia,
@@ -31,12 +31,11 @@ from robotid.robot.parameters import (
     pseudo_inertia_basis,
 )
 
-_EXACT = 1e-12  # relative decrease of the objective per step at which a fit is exact
 _ROUGH = 1e-6  # ... and at which it is sufficient for a prediction
 _TOGETHER = 2**17  # entries of the data sets that are fitted in one pass: they fit into a cache
 _CONTRADICTED = 1e-7  # distance of the NNLS problem below which the inequalities contradict
 _THINNEST = 0.01  # smallest relative thickness of a prior's pseudo-inertia
-_SIZE, _ENTRIES = 4, 10  # of a pseudo-inertia, and of its upper triangle
+_ENTRIES, _SIZE, _ = pseudo_inertia_basis().shape  # of an upper triangle, of a pseudo-inertia
 _MOST = 100  # steps; 8 to 20 are typical
 _BACK = 0.995  # largest step as a share of the step length to the boundary
 _FIRST = 1e-2  # initial t over the squared torque error of the prior, per eigenvalue
@@ -221,7 +220,7 @@ class Programme:
                 point = self._first(A[k], d[k], weight)
             else:
                 point = self._near(starts[k], weight)
-            minima += self._descended(point, A[k], d[k], weight, _EXACT if is_exact else _ROUGH)
+            minima += self._descended(point, A[k], d[k], weight, ROUNDING if is_exact else _ROUGH)
         return minima
 
     def _descended(

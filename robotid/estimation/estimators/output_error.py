@@ -14,11 +14,12 @@ import numpy as np
 import scipy.linalg
 
 from robotid.base.exceptions import DataError, NotConvergedError
+from robotid.base.tolerances import ROUNDING, TINY
 from robotid.base.typing import Array, ProgressCallback, ignore_progress
 from robotid.dynamics.factors import Factors, triangle_of
 from robotid.estimation.estimators.estimator import (
     FEWEST_SEGMENTS,
-    ROUNDING,
+    SEGMENTS,
     Estimate,
     Estimator,
     at_least,
@@ -32,10 +33,6 @@ _SETTLED = 2e-2  # relative change of whitening and noise levels at which a fit 
 _ROUGH, _CLOSE = 1e-3, 1e-5  # relative decrease that ends the first round, and the others
 _TOO_STIFF = 1e10  # damping at which no step reduces the cost any more
 _NO_TRACE = 1e-3  # effect of an initial state in noise levels below which it is neglected
-#: Number of segments for the scatter of scores: few enough that each is longer than the time for
-#: which an encoder stays at one step while a joint reverses.
-_SEGMENTS = 48
-_LOST = 1e-6  # relative reduction of the prior variance below which a parameter is undetermined
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,7 +298,7 @@ class OutputError(Estimator[Simulator]):
         independent = np.diag(bread @ H @ bread.T)
         gained = 1.0 - independent * known  # relative reduction of each prior variance
         names, theta = np.array(simulator.names), theta + change
-        undetermined = tuple(names[gained < _LOST].tolist())
+        undetermined = tuple(names[gained < TINY].tolist())
         at_bound = tuple(names[is_at_bound(simulator, theta)].tolist())
         return Estimate(
             theta=theta,
@@ -427,7 +424,7 @@ def _segments(
     total, names = sum(len(b) for _, b, _ in parts), tuple(map(str, range(c)))
     segments: list[Factors] = []
     for A, b, columns in parts:
-        cuts = max(1, round(_SEGMENTS * len(b) / total))
+        cuts = max(1, round(SEGMENTS * len(b) / total))
         if are_windows:
             cuts = math.ceil(FEWEST_SEGMENTS / len(parts))
         for rows in np.array_split(np.arange(len(b)), cuts):

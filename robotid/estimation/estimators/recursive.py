@@ -11,13 +11,13 @@ import numpy as np
 from scipy.linalg.lapack import dtpqrt
 
 from robotid.base.exceptions import DataError, RankDeficientError
+from robotid.base.tolerances import ROUNDING
 from robotid.base.typing import Array
-from robotid.dynamics.factors import Factors, Problem, Sample, shuffled
+from robotid.dynamics.factors import PANEL, Factors, Problem, Sample, shuffled
 from robotid.estimation.estimators.batch import SILENT, solve_factor
 from robotid.estimation.estimators.determination import PRIOR_LED
 from robotid.estimation.estimators.estimator import (
     ALIKE,
-    ROUNDING,
     Estimate,
     Estimator,
     Weighing,
@@ -26,7 +26,6 @@ from robotid.estimation.estimators.estimator import (
 
 StateT = TypeVar("StateT")
 
-_BLOCK = 8  # block size of LAPACK
 _PATIENCE = 50  # largest number of successive rows of a joint that the gate rejects
 _AVERAGE = 3.0  # weight of the newest iterate: 3 / (k + 2), the initial value decays as k^-3
 _MEMORY = 1000.0  # [samples] over which PRX and the residuals are averaged
@@ -171,7 +170,7 @@ class RLS(Filter[RLSState]):
             row[i] = np.sqrt(1.0 - self.forgetting**c) / self.prior_std[i]
             row[c] = row[i] * self.prior[i]
             rows = np.vstack([rows, row])
-        R = dtpqrt(0, min(_BLOCK, len(before)), before, rows)[0]
+        R = dtpqrt(0, min(PANEL, len(before)), before, rows)[0]
         return RLSState(R, count, state.steps + 1)
 
     def estimate(self, state: RLSState, names: tuple[str, ...]) -> Estimate:

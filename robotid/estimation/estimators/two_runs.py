@@ -17,19 +17,19 @@ import numpy as np
 import scipy.linalg
 
 from robotid.base.exceptions import DataError, NotConvergedError
+from robotid.base.tolerances import ROUNDING
 from robotid.base.typing import Array
 from robotid.dynamics.factors import Factors, Reduction, merge, triangle_of
 from robotid.estimation.estimators.estimator import (
     FEWEST_SEGMENTS,
     LEAST_FREEDOM,
-    ROUNDING,
+    WEAK_PRIOR,
     at_least,
     sandwich,
     scatter,
 )
 from robotid.robot.parameters import ParameterLayout
 
-_WIDE = 10.0  # factor of the prior standard deviations about the URDF's values
 _FLOOR = 1e-7  # smallest noise level over the torque, for noise-free data
 _STEPS = 50
 _SETTLED = 1e-9  # relative change of the gains at convergence
@@ -272,11 +272,11 @@ def payload_runs(
     changing = [not term.is_inertia for _, term in layout.drive_parameters]
     drives = layout.n_inertial + np.flatnonzero(changing)
     free = np.isnan(known)
-    KS = K * (_WIDE * spread)
+    KS = K * (WEAK_PRIOR * spread)
     sizes = np.linalg.norm(KS, axis=1)
     alike = KS / sizes[:, None]  # base parameters in units of their spread
     about_urdf = np.linalg.inv(alike @ alike.T) / np.outer(sizes, sizes)
-    change = _WIDE * np.append(spread[drives], size[free])
+    change = WEAK_PRIOR * np.append(spread[drives], size[free])
     return TwoRuns(
         tuple(reduction.factors for reduction in reference),
         tuple(reduction.factors for reduction in loaded),

@@ -8,9 +8,9 @@ from typing import Any, Self
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
 from robotid.base.settings import Range, Settings, require_kind, setting
+from robotid.robot.tree import LARGEST
 
 _NOT_NEGATIVE = Range("x >= 0", lambda x: x >= 0)
-_LARGEST = 1e9  # [kg] or [m] of bounds, as of numbers in a URDF
 _WINDOW = Range("0.05 s or more", lambda x: 0.05 <= x < math.inf)
 _FINITE = Range("a positive, finite number", lambda x: 0 < x < math.inf)
 
@@ -65,11 +65,11 @@ def _interval(value: object, what: str) -> tuple[float, float]:
     pair = [value, value] if _is_number(value) else value
     if not (isinstance(pair, Sequence) and len(pair) == 2 and all(map(_is_number, pair))):
         raise SettingsError(f"{what} is {value!r}, wanted a number or [smallest, largest] [kg]")
-    low, high = (math.inf if abs(x) > _LARGEST else float(x) for x in pair)
+    low, high = (math.inf if abs(x) > LARGEST else float(x) for x in pair)
     if not (math.isfinite(low) and math.isfinite(high)):
         raise SettingsError(
-            f"{what} is {value!r}, wanted finite numbers of at most {_LARGEST:g} kg; write "
-            f"{_LARGEST:g} for no upper bound"
+            f"{what} is {value!r}, wanted finite numbers of at most {LARGEST:g} kg; write "
+            f"{LARGEST:g} for no upper bound"
         )
     if not low <= high:
         raise SettingsError(
@@ -86,10 +86,10 @@ def _corners(value: Any, name: str) -> tuple[list[float], list[float]]:  # noqa:
     except (TypeError, ValueError, OverflowError):
         corners = []
     is_box = [len(corner) for corner in corners] == [3, 3]
-    if not is_box or not all(abs(x) <= _LARGEST for corner in corners for x in corner):
+    if not is_box or not all(abs(x) <= LARGEST for corner in corners for x in corner):
         raise SettingsError(
             f"com of {name} is {value!r}, wanted [[x, y, z], [x, y, z]] [m], each value at most "
-            f"{_LARGEST:g}"
+            f"{LARGEST:g}"
         )
     low, high = corners
     if any(a > b for a, b in zip(low, high, strict=True)):

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from robotid.base.exceptions import NotConvergedError, RankDeficientError, SettingsError
+from robotid.base.tolerances import CONVERGED
 from robotid.base.typing import Array
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors, Reduction, gather, join
@@ -64,10 +65,9 @@ from robotid.robot.bodies import body_boxes, held_parameters, negligible_bodies
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
-_FOLDS = 6  # of the cross-validation, prior_weight = "cv"
-_MOST_LOADS = 20  # largest number of fits until the joint load torque has converged
+FOLDS = 6  # of the cross-validation, prior_weight = "cv"
+MOST_LOADS = 20  # largest number of fits until the joint load torque has converged
 _DAMPED = 3  # number of fits after which only half of each change is applied
-_SETTLED = 1e-3  # change of the torque, relative to it, at which the fits have converged
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +143,7 @@ def consistent_fit(choice: BoundedSettings, known: Known) -> Consistent:
         constraints=make_constraints(bounds, extent),
         wls_noise=known.sigma,
     )
-    folds = gather(known.held_out, _FOLDS)
+    folds = gather(known.held_out, FOLDS)
     how = {"auto": "cv"}.get(stated, stated) if isinstance(stated, str) else ""
     if how == "cv" and len(folds) < 2:
         how = ""
@@ -330,7 +330,7 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
         return recordings
     choice = rough_choice(choice)
     trial, spread = replace(recordings, validation=()), None  # no predictions are needed here
-    for step in range(_MOST_LOADS):
+    for step in range(MOST_LOADS):
         ground = _ground(trial, choice, is_last=False, spread=spread)
         before, levels = ground.before, ground.rough.sigma
         spread = before.spread  # the same for any load
@@ -339,7 +339,7 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
         if step >= _DAMPED:  # friction that depends strongly on the load may overshoot
             standard = standard - 0.5 * moved
         changes, torques = (_torque_norms(ground, x) for x in (moved, standard))
-        if (changes <= _SETTLED * torques).all():
+        if (changes <= CONVERGED * torques).all():
             estimator = make_estimator(choice, before)
             if estimator.reads == "factors":
                 standard = before.standard(estimator.fit(ground.factors))
@@ -347,7 +347,7 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
             return recordings.with_model(recordings.model.with_reference(standard))
         trial = replace(trial, levels=levels).with_model(trial.model.with_reference(standard))
     raise NotConvergedError(
-        f"the joint load torque has not converged after {_MOST_LOADS} fits; set friction = "
+        f"the joint load torque has not converged after {MOST_LOADS} fits; set friction = "
         "'viscous+coulomb', or record a motion that excites more parameters",
         "max_iterations",
     )

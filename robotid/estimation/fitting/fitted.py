@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed, suggestion
 from robotid.base.settings import is_number, require_kind
+from robotid.base.tolerances import TINY
 from robotid.base.typing import Array, real_numbers
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors
@@ -48,8 +49,7 @@ SOURCES = ("data", "mixed", "prior", "bound")  # of the value of a standard para
 #: Standard error over prior standard deviation below which the source is the data (a change above
 #: it does not come from the prior alone), and above which it is the prior.
 FROM_DATA, FROM_PRIOR = 0.3, 0.9
-_WORSE = 1.2  # error of WLS over that of the estimate above which it is clearly worse
-_AT_BOUND = 1e-6  # size of a drive term at its bound of 0, in prior standard deviations
+CLEARLY = 1.2  # ratio of the errors of two fits above which one is clearly worse
 _SPEEDS = 20  # points of a friction curve in each direction
 
 
@@ -266,7 +266,7 @@ class Fit(Identified, Solution):
     def at_bound(self) -> Array:
         """Which drive terms are at their bound of 0 and have no standard error, shape (p,)."""
         is_bounded = bool(self.estimate.details.get("constraints"))
-        is_zero = self.standard <= _AT_BOUND * self.prior_std
+        is_zero = self.standard <= TINY * self.prior_std
         return np.asarray(self.model.layout.is_nonnegative() & is_zero & is_bounded)
 
     @property
@@ -412,7 +412,7 @@ class Fit(Identified, Solution):
         return frozenset(
             joint
             for joint in (pairs[0][0] if pairs else ())
-            if all(wls[joint].rmse > _WORSE * estimate[joint].rmse for estimate, wls in pairs)
+            if all(wls[joint].rmse > CLEARLY * estimate[joint].rmse for estimate, wls in pairs)
         )
 
 

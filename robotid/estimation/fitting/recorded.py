@@ -54,12 +54,12 @@ from robotid.dynamics.prepared_logs import (
 )
 from robotid.dynamics.rows import COMPILED, choose_engine, friction_speeds, keep_inertial_rows
 from robotid.dynamics.torque import is_loaded, remember
+from robotid.estimation.estimators.estimator import SEGMENTS
 from robotid.estimation.work_plan import WorkPlan
 from robotid.robot.model import RobotModel
 
 PIECE = 16384  # default number of rows of a piece
 WINDOW = 20_000  # rows of each window that is checked
-_SEGMENTS = 48  # of all logs in memory: enough to estimate the scatter of their scores
 _CORRELATIONS = 10  # shortest segment, in correlation times of filtered noise
 _SEGMENTS_IN_FILE = 64  # largest number of segments of a log in a file
 _FACTORS = 2**26  # largest size of all their factors [bytes], with at least _FEW segments per log
@@ -584,7 +584,7 @@ class Recordings:
 
     def segment_length(self, k: int) -> int:
         """Return the samples of each segment of a log in memory."""
-        samples, count = len(self.fitted[k].whole.trajectory.t), -(-_SEGMENTS // len(self.fitted))
+        samples, count = len(self.fitted[k].whole.trajectory.t), -(-SEGMENTS // len(self.fitted))
         shortest = round(_CORRELATIONS / independent_share(self.fitted[k].signals))
         if self.model.is_static:  # means of segments, not filtered
             shortest = 1

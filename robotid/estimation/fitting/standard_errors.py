@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from robotid.base.tolerances import SLACK
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.dynamics.base_parameters import BaseMapping
@@ -23,7 +24,6 @@ from robotid.robot.model import RobotModel
 _DRAWS = 64  # fits to resampled data and prior, for standard errors with active bounds
 _LEAST_SOLVED = 0.8  # smallest share of them that must be solved
 QUANTILE = 1.96  # half-width of a 95 % band in standard deviations
-_ROUNDING = 1e-9  # relative tolerance for a row on the edge of the band
 _MOST = 500  # largest number of samples at which a band is computed
 
 
@@ -175,7 +175,7 @@ class TorqueBand:
         """Return the share of torques (N, n_rows) in the 95 % band or on its edge, (n_rows,)."""
         used = mask[self.samples]
         error = np.abs(tau[self.samples] - prediction[self.samples])
-        is_inside = (error <= (1.0 + _ROUNDING) * QUANTILE * self.total) & used
+        is_inside = (error <= (1.0 + SLACK) * QUANTILE * self.total) & used
         count = used.sum(axis=0)
         return np.where(count > 0, is_inside.sum(axis=0) / np.maximum(count, 1), np.nan)
 

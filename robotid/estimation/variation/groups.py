@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from robotid.base.tolerances import LEAST_DIVISOR, SINGULAR
 from robotid.base.typing import Array
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors
@@ -28,8 +29,6 @@ _ZERO = {"rad": 0.005, "m": 0.001}  # ... of the zero of a position
 _LEVER = 0.01  # ... and its torque over that of its joint, at least
 _PAYLOAD = ("m", "mcx", "mcy", "mcz")
 _SMALLEST = 0.01  # torque of a drive over that of its largest term below which this share counts
-_RANK = 1e-9  # eigenvalue over the largest below which a run does not determine a direction
-_LEAST = 1e-12  # smallest information and inflation
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,14 +201,14 @@ def inflation_of(runs: Sequence[tuple[Array, Array]]) -> float:
 
 
 def _ratio(scatter: float, expected: float) -> float:
-    return max(scatter / expected, _LEAST) if expected > _LEAST else 1.0
+    return max(scatter / expected, LEAST_DIVISOR) if expected > LEAST_DIVISOR else 1.0
 
 
 def _scatter(runs: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
     """Return the scatter of the scores of segments, and the one of independent rows."""
     scatter, expected = 0.0, 0.0
     for H, g in runs:
-        bread = np.linalg.pinv(H.sum(axis=0), rcond=_RANK, hermitian=True)
+        bread = np.linalg.pinv(H.sum(axis=0), rcond=SINGULAR, hermitian=True)
         scores = g - H @ (bread @ g.sum(axis=0))
         scatter += float(np.einsum("si,ij,sj->", scores, bread, scores))
         leverage = H @ bread
@@ -224,6 +223,6 @@ def _scale(group: Group, centre: Array, H: Array, model: RobotModel, standard: A
     if group.kind == "payload":
         mass = _MASS * float(standard[: model.layout.n_inertial : 10].sum())
         return mass * np.array([1.0, _REACH, _REACH, _REACH])
-    norms = np.sqrt(np.maximum(np.diag(H), _LEAST))
+    norms = np.sqrt(np.maximum(np.diag(H), LEAST_DIVISOR))
     torque = np.sqrt(max(float(centre @ H @ centre), 0.0))
     return np.asarray(_DRIVE * np.maximum(torque, _SMALLEST * norms.max()) / norms)

@@ -9,6 +9,7 @@ import numpy as np
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import Finding, by_severity, listed, quoted
+from robotid.base.tolerances import LEAST_DIVISOR
 from robotid.base.typing import Array, ProgressCallback, ignore_progress, report_stage
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
@@ -16,10 +17,10 @@ from robotid.data.signals import unwrap
 from robotid.diagnosis.catalogue import entries, finding
 from robotid.diagnosis.verdict.fit_findings import not_written, unlike_findings
 from robotid.diagnosis.verdict.parameter_table import correlated_sets
-from robotid.diagnosis.verdict.verdict import Verdict, blocking, judge_positions
+from robotid.diagnosis.verdict.verdict import NAMED, Verdict, blocking, judge_positions
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.friction_projection import DriveMoments, drive_moments
-from robotid.dynamics.simulation.loops import Loops, open_loops
+from robotid.dynamics.simulation.loops import LOOP_GAP, Loops, open_loops
 from robotid.dynamics.torque import predict_instants
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import segment_scores
@@ -29,7 +30,7 @@ from robotid.estimation.fitting.fitted import FROM_PRIOR, sources_of
 from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.estimation.variation.groups import FEWEST_RUNS, Group, RunsOf, inflation_of
 from robotid.estimation.variation.spread import Runs
-from robotid.estimation.variation.variation import vary
+from robotid.estimation.variation.variation import PLAUSIBLE, vary
 from robotid.identification.closed_loop.initial_values import CLEAR, parallel_axes
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.loop_simulator import (
@@ -54,16 +55,13 @@ from robotid.robot.drives import TERMS, Spring
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
-_CHANGE = 0.1  # plausible standard deviation of a parameter between logs, over its value
-_LEAST = 0.01  # ... at least, over its prior standard deviation
+_LEAST = 0.01  # plausible change between logs, at least, over the prior standard deviation
 _CAUTIONS = ("at_bound", "coarse_steps", "gains_contradicted")  # with these no result is good
-_GAP = 3.0  # step in time above which no speed is computed [median steps]
 _MOVING = 0.05  # smallest speed above the noise, relative to the largest speed of a joint
 _MISMATCH = 0.5  # largest relative error of a torque that the loop of its joint gives
 _KNOWN = 0.1  # standard error of a known delay, relative to the range found from one response
 _POSITIVE = ("kp", "limit")  # parameters whose lower bound is more than 0
 _UNEQUAL = 3.0  # ratio of the gains of equal drives from which on they are reported
-_NAMED = 8  # largest number of parameters that a sentence names
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -312,7 +310,7 @@ def loop_runs(
         members = [simulator.free_parameters[k] for k in places]
         centre, spread = estimate.theta[places], simulator.prior_std[places]
         spread = np.where(np.isfinite(spread), spread, 0.0)
-        scale = np.maximum(_CHANGE * np.abs(centre), np.maximum(_LEAST * spread, 1e-12))
+        scale = np.maximum(PLAUSIBLE * np.abs(centre), np.maximum(_LEAST * spread, LEAST_DIVISOR))
         group = Group(
             "drive", members[0].name.rpartition(".")[0], tuple(free.name for free in members),
             tuple(units_of(model, free) for free in members), np.zeros((0, len(members))),
@@ -348,7 +346,7 @@ def _errors(covariance: Array) -> Array:
 def logged_motion(log: Log) -> Trajectory:
     """Return the motion of a log of commands: positions and their numerical derivatives."""
     dt, v, still = np.diff(log.t), np.zeros_like(log.q), np.zeros_like(log.q)
-    segment = np.append(0, np.cumsum(dt > _GAP * np.median(dt)))
+    segment = np.append(0, np.cumsum(dt > LOOP_GAP * np.median(dt)))
     for rows in (segment == k for k in range(segment[-1] + 1)):
         if rows.sum() > 1:
             v[rows] = np.gradient(log.q[rows], log.t[rows], axis=0)
@@ -382,7 +380,7 @@ def _of_fit(result: PositionIdentification) -> Iterator[Finding]:
         kp = zip(result.model.joints, (factor * result.fit.loops.kp).tolist(), strict=True)
         yield finding(
             "gains_contradicted", subject="controller", what=result.fit.simulator.knows_torques,
-            agreeing=listed([f"{joint} = {value:.3g}" for joint, value in kp], _NAMED),
+            agreeing=listed([f"{joint} = {value:.3g}" for joint, value in kp], NAMED),
             scale=factor, std_error=scale.common_error,
         )  # fmt: skip
     if (halving := float(estimate.details.get("halving", 0.0))) > 1.0:
@@ -412,7 +410,7 @@ def _of_fit(result: PositionIdentification) -> Iterator[Finding]:
 
 def _named(code: str, names: Sequence[str], **values: Any) -> Finding:  # noqa: ANN401
     """Return a finding about parameters."""
-    words = listed(names, _NAMED)
+    words = listed(names, NAMED)
     return finding(code, subject=words, names=words, **values)
 
 
@@ -458,7 +456,7 @@ def _at_bound(result: PositionIdentification) -> Iterator[Finding]:
             remedies.append(f"compare {' and '.join(gains)} with the gains of the drive")
         if "delay" in stated:
             remedies.append("leave the delay out of [controller], so that it is fitted")
-        remedies.append(f"command a motion that depends more on {listed(at_zero, _NAMED)}")
+        remedies.append(f"command a motion that depends more on {listed(at_zero, NAMED)}")
         todo = "; ".join(remedies)
         todo = f"{todo[0].upper()}{todo[1:]}"
         yield _named("at_bound:zero", at_zero, wrong=wrong, todo=todo)

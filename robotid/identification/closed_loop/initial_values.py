@@ -12,6 +12,7 @@ from itertools import product
 import numpy as np
 
 from robotid.base.exceptions import NotConvergedError
+from robotid.base.tolerances import TINY
 from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
@@ -20,6 +21,7 @@ from robotid.dynamics.rows import flatten
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, Loops, Window
 from robotid.dynamics.simulation.simulation_settings import PerJoint
 from robotid.dynamics.torque import predict_instants
+from robotid.estimation.estimators.estimator import WEAK_PRIOR
 from robotid.estimation.estimators.output_error import OutputError
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.loop_simulator import (
@@ -40,10 +42,8 @@ _DELAYS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08)  # delays that are tried [s]
 _FITTED = 16  # number of windows of the fit; the grid search has the first half as many
 _SHOWS = 1e-3  # smallest identifiable inertia, over that of the fastest loop ...
 _CLEAR = 2.0  # ... and over its standard error
-_LOWEST = 1e-6  # lower bound of the inertia, over its initial value
 _TERMS = (TERMS["viscous"], TERMS["coulomb"], TERMS["offset"])
 _STEPS = 12  # of the fit
-_WIDE = 10.0  # prior spread of drive parameters over their typical size: a weak prior
 _SHARE = 0.5  # initial share of the bodies in a joint's inertia, where its gain is unknown
 _ZERO_SPREAD = 0.3  # prior spread of an encoder's zero about its first estimate [rad or m]
 _SMALLEST_BODY = 0.3  # smallest body inertia over the largest: small joints have gears, too
@@ -60,7 +60,6 @@ _SAMPLES = 400  # of all logs together
 _SLOW, _FAST = 0.4, 4.0  # cut-offs of the slow motion and of the sign of friction [Hz]
 _PERIODS = 30  # smallest number of cut-off periods in all logs together
 _RANGE = 0.4  # smallest range of a joint whose zero is identified [rad]
-_SAME = 1.0 - 1e-6  # smallest cosine of parallel axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +140,7 @@ def fit_second_order(
     free: list[FreeParameter] = []
     for j, joint in enumerate(robot.model.joints):
         J, T, F = float(start.armature[j]), float(start.delay[j]), float(start.limit[j])
-        free.append(FreeParameter(f"{joint}.armature", "armature", (j,), J, 10 * J, _LOWEST * J))
+        free.append(FreeParameter(f"{joint}.armature", "armature", (j,), J, 10 * J, TINY * J))
         for k, term in enumerate(_TERMS):
             value = float(start.values[len(_TERMS) * j + k])
             spread = 100 * torque[j] * (10.0 if term.name == "viscous" else 1.0)
@@ -149,7 +148,7 @@ def fit_second_order(
         if finds_delay:
             free.append(FreeParameter(f"{joint}.delay", "delay", (j,), T, LONGEST_DELAY, 0.0))
         if finds_limit:
-            free.append(FreeParameter(f"{joint}.limit", "limit", (j,), F, 10 * F, _LOWEST * F))
+            free.append(FreeParameter(f"{joint}.limit", "limit", (j,), F, 10 * F, TINY * F))
     some = windows[:: max(1, len(windows) // _FITTED)]
     simulator = LoopSimulator(robot, some, start, tuple(free))
     estimate = OutputError(whitens=False, steps=_STEPS).fit(simulator)
@@ -321,16 +320,16 @@ def free_drive_parameters(
     found = []
     for what, sharing, is_free, spread in (
         ("armature", members, has_armature, typical.inertia),
-        ("kp", members, closed_kp, base.kp / _WIDE),
+        ("kp", members, closed_kp, base.kp / WEAK_PRIOR),
         ("kd", members, ~is_stated(loop.kd, model) & finds_kd, typical.torque / typical.speed),
         ("limit", alone, finds_limit, typical.torque),
-        ("delay", delayed, closed_delay, np.full(len(groups), LONGEST_DELAY / _WIDE)),
+        ("delay", delayed, closed_delay, np.full(len(groups), LONGEST_DELAY / WEAK_PRIOR)),
     ):
         for name, joints in sharing.items():
             sharers = [j for j in joints if is_free[j]]
             if sharers:
                 initial = float(np.median(getattr(base, what)[sharers]))
-                wide = _WIDE * float(np.median(spread[sharers]))
+                wide = WEAK_PRIOR * float(np.median(spread[sharers]))
                 lowest = _LEAST * initial if what in ("kp", "limit") else 0.0
                 found.append(
                     FreeParameter(f"{name}.{what}", what, tuple(sharers), initial, wide, lowest)
@@ -344,7 +343,7 @@ def free_drive_parameters(
             for owners in [having] if is_viscous else [[j] for j in having]:
                 name = group if len(owners) > 1 else model.joints[owners[0]]
                 initial = float(np.median([base.values[base.place(j, term)] for j in owners]))
-                wide = _WIDE * float(np.median(size[owners]))
+                wide = WEAK_PRIOR * float(np.median(size[owners]))
                 found.append(FreeParameter.of_term(name, term, tuple(owners), initial, wide))
     return found
 
@@ -412,7 +411,7 @@ def parallel_axes(model: RobotModel) -> list[tuple[str, ...]]:
         above, placement = int(tree.parents[body]), tree.joints[body]
         axis = placement[36:39]
         in_parent = (placement[:9] + placement[9:18]).reshape(3, 3).T @ axis  # constant there
-        parallel = above >= 0 and abs(float(in_parent @ tree.joints[above][36:39])) > _SAME
+        parallel = above >= 0 and abs(float(in_parent @ tree.joints[above][36:39])) > 1.0 - TINY
         joined[body] = joined[above] if parallel else []
         joined[body].append(int(tree.leaders[body]))
     chains = {id(chain): tuple(model.joints[j] for j in chain) for chain in joined.values()}

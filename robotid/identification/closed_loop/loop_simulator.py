@@ -15,9 +15,10 @@ import numpy as np
 import scipy.linalg
 
 from robotid.base.exceptions import NotConvergedError
+from robotid.base.tolerances import SLACK
 from robotid.base.typing import Array
 from robotid.data.signals import local_polynomial
-from robotid.diagnosis.decisions import SIMULATED_FAMILY, Round
+from robotid.diagnosis.decisions import AGREES, BEYOND_NOISE, SIMULATED_FAMILY, Round
 from robotid.dynamics.simulation.loops import (
     ClosedLoopRobot,
     Column,
@@ -33,6 +34,7 @@ from robotid.estimation.estimators.output_error import (
     is_at_bound,
     linearised,
 )
+from robotid.estimation.fitting.fit import FOLDS
 from robotid.robot.drive_term import ANYWHERE, DriveTerm
 from robotid.robot.drives import FAMILIES, LoadFriction, PositionCoulomb
 from robotid.robot.model import RobotModel
@@ -41,8 +43,6 @@ from robotid.robot.prior import with_assumed_inertials
 
 #: Largest delay that is tried [s].
 LONGEST_DELAY = 0.1
-#: Smallest significant difference [standard errors].
-SIGNIFICANT = 3.0
 
 _WHOLE = 0.15  # distance from a whole lag below which the lag is whole [samples]
 _SMOOTH = 0.02  # half-width of the differentiating filter [s]
@@ -50,14 +50,11 @@ _FREE = 0.95  # torque relative to the limit, below which the drive is not satur
 _STARTS = 2  # steps of the initial states of windows
 _SHARES = (1.0, 0.3, 0.1)  # step lengths that are tried
 _NEAR = 3.0  # prior of an initial position about the measured one [RMS position errors]
-_POSSIBLE = 1e-9  # smallest relative eigenvalue of the pseudo-inertia of a body that may change
 #: Entries of a body's triangle: the logarithm of the root of its mass, and its centre.
 _ENTRIES = ((3, 3), (0, 3), (1, 3), (2, 3))
 _OFFERED = ("stribeck", "load", "position")  # candidate families of friction terms
-_FOLDS = 6
 _SLOW = 0.3  # Stribeck speed of candidates, over the typical speed of the joint
 _WIDE = 0.05  # smallest half-range of a position-dependent candidate [rad or m]
-_LARGE = 0.05  # smallest relevant difference of a scale; missing friction terms cause smaller ones
 
 _log = logging.getLogger(__name__)
 
@@ -154,7 +151,7 @@ def find_gains(
         bend, slope = 2 * (least + next_ - 2 * half), 4 * half - 3 * least - next_
         share = np.clip(-slope / np.maximum(2 * bend, 1e-300), 0.0, 1.0)
         gain = -(slope + bend * share) * share
-        is_between = (gain > SIGNIFICANT**2 * least / rows) & (share > _WHOLE)
+        is_between = (gain > BEYOND_NOISE**2 * least / rows) & (share > _WHOLE)
         lag = np.where(is_between, whole + side * share, lag)
     gains = _fit_gains(outs, loops, is_free, lag)[1]
     kp, kd = np.where(gains > 0, gains, [loops.kp, loops.kd])
@@ -220,7 +217,8 @@ def free_body_parameters(robot: ClosedLoopRobot, spread: float) -> list[FreePara
     """
     layout = robot.model.layout
     J = pseudo_inertia(robot.model.standard_parameters()[: layout.n_inertial])
-    is_possible = [low > _POSSIBLE * high for low, *_, high in np.linalg.eigvalsh(J)]
+    # a body may change if it is possible and is not at the limit of it
+    is_possible = [low > SLACK * high for low, *_, high in np.linalg.eigvalsh(J)]
     bodies = zip(layout.bodies, robot.joint_of_body, is_possible, strict=True)
     return [
         FreeParameter(f"{name}.{what}", "body", (joint,), 0.0, spread, coordinate=k)
@@ -610,7 +608,7 @@ def _folds(
     simulator: LoopSimulator, theta: Array, estimator: OutputError
 ) -> tuple[Array, Array, int]:
     """Return A'A, (K, c, c), and A'b, (K, c), of K folds with equal priors, and rows per joint."""
-    count, rows = min(_FOLDS, len(simulator.windows)), 0
+    count, rows = min(FOLDS, len(simulator.windows)), 0
     known = 1.0 / simulator.prior_std**2 / count
     H = np.tile(np.diag(known), (count, 1, 1))
     g = np.tile(known * (simulator.prior - theta), (count, 1))
@@ -661,8 +659,9 @@ class GainScale:
     def is_wrong(self) -> bool:
         """Whether the common factor of all gains is not 1, and each joint is consistent with it."""
         error = np.hypot(self.error, self.common_error)
-        agree = np.abs(self.change - self.common) <= SIGNIFICANT * error
-        is_other = abs(self.common) > max(SIGNIFICANT * self.common_error, _LARGE)
+        agree = np.abs(self.change - self.common) <= BEYOND_NOISE * error
+        # missing friction terms cause smaller differences
+        is_other = abs(self.common) > max(BEYOND_NOISE * self.common_error, AGREES)
         return bool(is_other and agree.all())
 
 

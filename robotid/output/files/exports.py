@@ -21,11 +21,12 @@ from robotid.base.files import write_text
 from robotid.base.findings import listed
 from robotid.base.settings import require_kind
 from robotid.base.text import yaml_name, yaml_plain
+from robotid.base.tolerances import ROUNDING
 from robotid.base.typing import Array
 from robotid.base.versions import __version__
 from robotid.dynamics.friction_projection import Projection, project_friction
 from robotid.output.files.result_file import CommandedDrive, Result, commanded_drives
-from robotid.output.files.urdf import DYNAMICS_TERMS, ROUNDING, link_parameters, write_urdf
+from robotid.output.files.urdf import DYNAMICS_TERMS, link_parameters, write_urdf
 from robotid.robot.bodies import Shape, find_mesh, inertial_parameters, link_places, read_shapes
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia

@@ -14,6 +14,7 @@ from robotid.base.exceptions import DataError, ModelError
 from robotid.base.files import check_path, moved_file, read_json
 from robotid.base.findings import listed, suggestion
 from robotid.base.settings import require_kind
+from robotid.base.tolerances import SLACK
 from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.diagnosis.verdict.parameter_table import parameter_table
@@ -36,7 +37,6 @@ SCHEMA_VERSION = 1
 #: Parameters of a joint's controller, 0 if a result lacks them.
 _OF_CONTROLLER = ("kd", "delay", "zero")
 _OF_DRIVE = ("armature", "viscous", "coulomb", "offset")
-_ROUNDING = 1e-9  # [-] of eigenvalues that may be 0
 
 
 @dataclass(frozen=True)
@@ -353,7 +353,7 @@ def _check_variation(result: Mapping[str, Any], at: str) -> None:
         size = len(sums["h"][0]) if sums["h"] else 0
         for key, shape in (("h", [k, size]), ("H", [k, size * (size + 1) // 2]), ("unit", [k])):
             require_lengths(sums[key], shape, f"{at}.sums.{key}")
-        _check_definite(RunSums.from_dict(sums).H, f"{at}.sums.H", least=-_ROUNDING)
+        _check_definite(RunSums.from_dict(sums).H, f"{at}.sums.H", least=-SLACK)
 
 
 def _check_definite(matrices: ArrayLike, at: str, least: float = 0.0) -> None:

@@ -19,6 +19,7 @@ from robotid.base.exceptions import DataError, ModelError
 from robotid.base.files import check_folder, folder_beside, read_json
 from robotid.base.findings import listed
 from robotid.base.settings import require_kind
+from robotid.base.tolerances import ROUNDING, TINY
 from robotid.base.typing import Array
 from robotid.base.versions import __version__
 from robotid.dynamics.friction_projection import Projection
@@ -42,9 +43,7 @@ from robotid.robot.tree import MOMENTS, Inertial
 #: The drive terms of ``<dynamics>``.
 DYNAMICS_TERMS = tuple(name for name, term in TERMS.items() if term.dynamics)
 _SCHEMA_VERSION = 1
-ROUNDING = 1e-12  # of the size of a parameter or a link, below which a difference is 0
 _STATES = 64  # random states at which the written file must give the same torque
-_SAME = 1e-6  # largest relative difference of a row's torque over these states
 
 
 def write_urdf(
@@ -339,7 +338,7 @@ def _check_torque(model: RobotModel, pi: Array, urdf: Path, sidecar: Path) -> No
         )
     )
     difference = np.linalg.norm(found - wanted, axis=0)  # (n_rows,)
-    off = np.flatnonzero(difference > _SAME * np.linalg.norm(wanted, axis=0))
+    off = np.flatnonzero(difference > TINY * np.linalg.norm(wanted, axis=0))
     if off.size:
         raise ModelError(
             f"{urdf.name} is not written: in the test reading, its torque differs from that of the "

@@ -12,6 +12,7 @@ from robotid.base.exceptions import DataError
 from robotid.base.files import check_file, write_text
 from robotid.base.findings import listed
 from robotid.base.text import period
+from robotid.diagnosis.decisions import BEYOND_NOISE
 from robotid.output.files.result_file import load_result
 from robotid.output.pages.html import (
     Cell,
@@ -29,7 +30,6 @@ from robotid.output.pages.html import (
 from robotid.output.report.tables import both
 from robotid.robot.drives import TERMS
 
-_FAR = 3.0  # combined standard errors beyond which a difference is in bold
 _FILES = ("urdf", "identification", "validation")  # settings that are shown as inputs
 
 
@@ -362,7 +362,7 @@ def _base_section(content: Mapping[str, Any]) -> str:
     ]
     entries, different = [], 0
     for entry in content["base_parameters"]:
-        is_far = [x is not None and abs(x) > _FAR for x in entry["differences"]]
+        is_far = [x is not None and abs(x) > BEYOND_NOISE for x in entry["differences"]]
         shown = [number(x, "z.1f") for x in entry["differences"]]
         shown = [_bold(x) if far else x for x, far in zip(shown, is_far, strict=True)]
         values = [
@@ -373,7 +373,7 @@ def _base_section(content: Mapping[str, Any]) -> str:
         rows = _cells(content, "difference", [None, *shown]) | _cells(content, "value", values)
         entries.append({**entry, **rows})
     table = listing("Base parameters ± standard errors", columns, entries, is_data=True)
-    figures = {"different": different, "count": len(entries), "far": f"{_FAR:g}"}
+    figures = {"different": different, "count": len(entries), "far": f"{BEYOND_NOISE:g}"}
     return block("comparison.base", table=table, **figures)
 
 

@@ -23,6 +23,7 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import write_text
 from robotid.base.settings import is_number, require_each, require_kind
 from robotid.base.typing import Array, real_numbers
+from robotid.data.units import LONG_STEP
 from robotid.output.pages.html import asset, packed, scaffold, script_json, stepped
 from robotid.robot.bodies import Shape, Surface, find_mesh, joined, read_shapes, read_surfaces
 from robotid.robot.model import RobotModel
@@ -387,7 +388,6 @@ _BINS = 480  # columns of the heat strip
 _PLOT_RATE = 50.0  # [Hz] points of a plot per second
 _DATA_RANGE = 100  # poses that determine the camera's view
 _GAP = 0.25  # [s] a longer time without samples is a gap ...
-_TIMES = 5.0  # ... if it is this multiple of the typical one
 
 
 @dataclass(frozen=True, eq=False)
@@ -569,7 +569,7 @@ def _keyframes(t: Array, rate: float, most: int) -> Array:
 
 def _gaps(t: Array) -> list[int]:
     steps = np.diff(t)
-    return np.flatnonzero((steps > _GAP) & (steps > _TIMES * np.median(steps))).tolist()
+    return np.flatnonzero((steps > _GAP) & (steps > LONG_STEP * np.median(steps))).tolist()
 
 
 def _moved(model: RobotModel, t: Array, q: Array, rate: float) -> dict[str, Any]:

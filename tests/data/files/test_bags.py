@@ -9,19 +9,17 @@ import numpy as np
 import pytest
 from helpers.recorders import (
     JOINT_STATE,
-    Bag1Writer,
-    Bag2Writer,
     StoragePlugin,
-    Stores,
     get_types_from_msg,
-    get_typestore,
     joint_state,
     messages_of,
     to_ns,
-    write_bag2,
+    types_of,
+    write_bag,
     write_controller,
     write_idl_controller,
     write_mcap,
+    write_states,
 )
 from helpers.synthetic import sine_log
 from mcap.writer import Writer as McapLibraryWriter
@@ -67,7 +65,7 @@ def test_the_clock_is_the_header_unless_stated(tmp_path):
 def test_the_topic_must_be_stated_if_several_would_do(tmp_path):
     log = sine_log()
     topics = {"/arm": messages_of(log), "/ghost": messages_of(replace(log, q=log.q + 1))}
-    path = write_bag2(tmp_path / "bag", topics, others=["/chatter"])
+    path = write_states(tmp_path / "bag", topics, others=["/chatter"])
     listing = (
         f"topics: {{'/arm': '{STATE}', '/chatter': 'std_msgs/msg/String', '/ghost': '{STATE}'}}"
     )
@@ -86,7 +84,7 @@ def test_the_topic_must_be_stated_if_several_would_do(tmp_path):
 
 
 def test_a_bag_without_joint_states_lists_what_it_holds(tmp_path):
-    path = write_bag2(tmp_path / "bag", {"/joint_states": []}, others=["/chatter"])
+    path = write_states(tmp_path / "bag", {"/joint_states": []}, others=["/chatter"])
     listing = f"topics: {{'/chatter': 'std_msgs/msg/String', '/joint_states': '{STATE}'}}"
     with refused(f"bag has no message of {STATE}; {listing}"):
         read_log(path, JOINTS)
@@ -108,7 +106,7 @@ def test_other_messages_are_passed_over_and_values_are_checked_as_in_any_log(tmp
     with pytest.raises(DataError, match=r"^deg.mcap: .* looks like degrees"):
         read_log(path, JOINTS)
     unstamped = [(0.0, *message[1:]) for message in messages_of(log)]
-    path = write_bag2(tmp_path / "bag", {"/joint_states": unstamped}, delay=1.0)
+    path = write_states(tmp_path / "bag", {"/joint_states": unstamped}, delay=1.0)
     with pytest.raises(DataError, match="header stamps of all 60 messages are 0"):
         read_log(path, JOINTS)
     t, names, q, v, tau = next(messages_of(log))
@@ -201,7 +199,7 @@ def paired(log, *, late=0.0035, every=1, first=0):
 
 def test_two_topics_of_joint_states_are_joined_by_holding_the_last_command(tmp_path):
     log = make_log(v_ref=None, tau_ref=None)
-    path = write_bag2(tmp_path / "bag", paired(log, every=2, first=4))
+    path = write_states(tmp_path / "bag", paired(log, every=2, first=4))
     back = read_log(path, JOINTS, needs="commands", source=COMMANDS)
     # commands 4, 6, ... come 3.5 ms after rows 4, 6, ...: row 5 is the first with one
     np.testing.assert_array_equal(back.t, log.t[5:])
@@ -231,7 +229,7 @@ def test_commands_of_a_topic_go_before_those_of_a_controllers_own_state(tmp_path
 
 
 def test_topics_of_commands_that_cannot_be_are_refused(tmp_path):
-    path = write_bag2(tmp_path / "bag", paired(make_log()), others=["/chatter"])
+    path = write_states(tmp_path / "bag", paired(make_log()), others=["/chatter"])
     for source, text in (
         (LogSource(command="/joint_comands"), "bag has no topic '/joint_comands'; topics: "),
         (
@@ -254,18 +252,9 @@ T = 5.0 + np.arange(40) / 100  # [s] of the joints
 S = 5.0 + np.arange(21) / 50 + 0.003  # [s] of the sensors
 BASE = BaseColumns(True)
 DEFINITION = (
-    """float32[4] quaternion
-float32[3] gyroscope
-float32[3] accelerometer
-""",
-    """float32 q
-float32 dq
-float32 tau_est
-""",
-    """unitree_go/IMUState imu_state
-unitree_go/MotorState[3] motor_state
-int16[4] foot_force
-""",
+    "float32[4] quaternion\nfloat32[3] gyroscope\nfloat32[3] accelerometer\n",
+    "float32 q\nfloat32 dq\nfloat32 tau_est\n",
+    "unitree_go/IMUState imu_state\nunitree_go/MotorState[3] motor_state\nint16[4] foot_force\n",
 )
 
 
@@ -280,8 +269,8 @@ def places(t):
 class Maker:
     """Messages of a store, by type."""
 
-    def __init__(self, store):
-        self.types = get_typestore(store)
+    def __init__(self, path):
+        self.types = types_of(path)
         kinds = [f"unitree_go/msg/{x}" for x in ("IMUState", "MotorState", "LowState")]
         for kind, text in zip(kinds, DEFINITION, strict=True):
             self.types.register(get_types_from_msg(text, kind))
@@ -336,18 +325,14 @@ class Maker:
         return self.new(LOW_STATE, imu, motors, np.array([20, 30, 40, 50], np.int16))
 
 
-def write(path, topics, store=Stores.ROS2_HUMBLE, plugin=StoragePlugin.MCAP):
+def write(path, topics, plugin=StoragePlugin.MCAP):
     """Write joint states and {topic: (type, {stamp: make message})}."""
-    maker, is_ros1 = Maker(store), path.suffix == ".bag"
-    types = maker.types
-    serialize = types.serialize_ros1 if is_ros1 else types.serialize_cdr
-    folder = {"version": 9, "storage_plugin": plugin}
-    with Bag1Writer(path) if is_ros1 else Bag2Writer(path, **folder) as bag:
-        for topic, (kind, stamps, make) in topics.items():
-            connection = bag.add_connection(topic, kind, typestore=types)
-            for k, t in enumerate(stamps):  # recorded one after the other, whatever their stamps
-                bag.write(connection, to_ns(5.0 + 0.01 * k), serialize(make(maker, t), kind))
-    return path
+    maker = Maker(path)
+    written = {  # recorded one after the other, whatever their stamps
+        topic: (kind, [(5.0 + 0.01 * k, make(maker, t)) for k, t in enumerate(stamps)])
+        for topic, (kind, stamps, make) in topics.items()
+    }
+    return write_bag(path, written, maker.types, plugin)
 
 
 def joints(maker, t):
@@ -362,8 +347,7 @@ INERTIAL = {"/imu": (IMU, S, Maker.imu)}
 
 @pytest.mark.parametrize("name", ["log", "log.bag"])
 def test_odometry_is_interpolated_at_the_stamps_of_the_joints(tmp_path, name):
-    store = Stores.ROS1_NOETIC if name == "log.bag" else Stores.ROS2_HUMBLE
-    path = write(tmp_path / name, LEG_STATES | ODOM | FORCE, store)
+    path = write(tmp_path / name, LEG_STATES | ODOM | FORCE)
     log = read_log(path, LEG, base=BASE)
     np.testing.assert_allclose(log.t, T[1:])  # the first joint state is before the odometry
     np.testing.assert_allclose(log.q[:, 1], 2 * log.t)

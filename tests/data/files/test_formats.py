@@ -19,11 +19,10 @@ from helpers.recorders import (
     StoragePlugin,
     messages_of,
     wide,
-    write_bag1,
-    write_bag2,
     write_mat5,
     write_mat73,
     write_mcap,
+    write_states,
 )
 from helpers.synthetic import sine_log
 
@@ -76,16 +75,19 @@ def across(path, log):
     return write_mat5(path, {k: x.T if x.ndim == 2 else x for k, x in wide(log, object).items()})
 
 
+def topics(log):
+    return {"/joint_states": messages_of(log)}
+
+
 def bag(path, log, **how):
-    topics = {"/joint_states": messages_of(log)}
-    return write_bag2(path.parent / "bag", topics, others=["/chatter"], **how)
+    return write_states(path.parent / "bag", topics(log), others=["/chatter"], **how)
 
 
 FORMATS = {
     "mcap": (".mcap", lambda path, log: write_mcap(path, messages_of(log))),
     "mcap folder": (".", lambda path, log: bag(path, log, plugin=StoragePlugin.MCAP)),
     "ros2 folder": (".", bag), "db3": (".", lambda path, log: next(bag(path, log).glob("*.db3"))),
-    "ros1": (".bag", lambda path, log: write_bag1(path, messages_of(log))), "npz": (".npz", npz),
+    "ros1": (".bag", lambda path, log: write_states(path, topics(log))), "npz": (".npz", npz),
     "npz columns": (".npz", npz_columns), "hdf5": (".h5", hdf5),
     "mat struct": (".mat", lambda path, log: write_mat5(path, {"log": wide(log), "comment": "x"})),
     "mat joints by samples": (".mat", across),

@@ -1,11 +1,12 @@
-"""Findings on the pose of a floating base: jumps, and the order of its quaternion."""
+"""Findings on a floating base: pose, twist, IMU, contacts and measured forces."""
 
 from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.stands import stand
+from helpers.legged import with_other_bodies
+from helpers.stands import recorded, stand
 
 from robotid.data.base_motion import (
     BaseMotion,
@@ -17,13 +18,21 @@ from robotid.data.base_motion import (
 )
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.logs.base_checks import check_base, check_pose, check_twist, check_unit
+from robotid.data.signals import process
+from robotid.diagnosis.logs.base_checks import (
+    check_base,
+    check_pose,
+    check_twist,
+    check_unit,
+    check_wrenches,
+)
 from robotid.dynamics.constraint_rows import constraint_jacobian
+from robotid.dynamics.torque import predict
 from robotid.robot.constraints import Contact, link_positions
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
-SLOW = SignalSettings(cutoff=4.0)
+SLOW, RAW = SignalSettings(cutoff=4.0), SignalSettings(cutoff=None, trim=0.0)
 FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
 
 
@@ -160,13 +169,13 @@ def free():
     return RobotModel.from_urdf(example_urdf("solo12.urdf"), free_flyer=True, terms=())
 
 
-def flight(free, noise=0.0):
-    """Return a log at 500 Hz with pose and right twist, with noise of the position [m]."""
+def flight(free, noise=0.0, about=(0.0, 0.0, 0.0)):
+    """Return a log at 500 Hz with pose about angles, right twist, noise of the position [m]."""
     t = 3.0 + 0.002 * np.arange(2000)
     pose = np.zeros((len(t), 7))
     pose[:, :3] = 0.1 * np.column_stack([np.sin(t), np.cos(2 * t), np.sin(3 * t)])
     angles = np.column_stack([0.2 * np.sin(2 * t), 0.1 * np.cos(3 * t), 0.15 * np.sin(t)])
-    pose[:, 3:] = quaternions_of_angles(angles)
+    pose[:, 3:] = quaternions_of_angles(about + angles)
     twist = base_state(t, pose, None, None)[1]
     pose[:, :3] += noise * np.random.default_rng(0).standard_normal((len(t), 3))
     q = np.zeros((len(t), 12))
@@ -202,6 +211,27 @@ def test_a_wrong_part_of_the_twist_is_named(free, change, words):
     assert all(text in found.message for text in words)
 
 
+@pytest.mark.parametrize("part", [slice(0, 3), slice(3, 6)])
+def test_a_twist_with_the_axes_of_the_world_is_found(free, part):
+    right = flight(free, about=(0.8, -0.5, 1.5))
+    wrong, twist = changed(right, turned=[part]), right.base.twist
+    assert not list(check_base(free, right, RAW))
+    (found,) = check_base(free, wrong, RAW)
+    assert (found.code, found.severity) == ("base_twist", "error")
+    assert "State twist = 'world' in [base]" in found.message
+    assert found.evidence["off_world"] < 1e-3 * found.evidence["off"]
+    off = np.sqrt(np.mean(np.sum((wrong.base.twist - twist)[:, part] ** 2, axis=1)))
+    size = np.sqrt(np.mean(np.sum(twist[:, part] ** 2, axis=1)))
+    assert [found.evidence[x] for x in ("off", "size")] == pytest.approx([off, size])
+    unit, what = ("m/s", "linear") if part.start == 0 else ("rad/s", "angular")
+    words = f"{what} velocity of the base differs by {off:.2g} {unit} from that of its pose, "
+    assert f"{words}{size:.2g} {unit} (RMS)" in found.message
+    other = next(check_base(free, changed(right, 2.0, 2.0), RAW))
+    linear = np.sqrt(np.mean(np.sum(twist[:, :3] ** 2, axis=1)))  # m/s
+    assert [other.evidence[x] for x in ("off", "size")] == pytest.approx([linear, linear])
+    assert "Check the columns base_vx to base_wz, or remove them" in other.message
+
+
 def test_axes_of_the_world_are_named_though_the_base_hardly_turns(free):
     """By 0.1 rad: the velocities differ by less than 30 % of the motion."""
     both = changed(flight(free), turned=[slice(0, 3), slice(3, 6)])
@@ -232,7 +262,6 @@ def test_a_right_twist_shows_that_the_quaternion_is_the_inverse(free):
 
 
 # --- IMU ------------------------------------------------------------------------------------------
-RAW = SignalSettings(cutoff=None, trim=0.0)
 G = np.array([0.0, 0.0, -9.81])
 TURN = pin.rpy.rpyToMatrix(0.4, 0.2, 1.0)  # axes of the IMU in the base
 ALIKE = np.eye(3)
@@ -352,3 +381,168 @@ def test_another_quaternion_is_named_without_a_position(robot, sway, change, wor
     assert [(x.code, x.severity) for x in found] == [("base_orientation", "error")]
     assert words in found[0].message
     assert found[0].evidence["best"] < 0.02 * found[0].evidence["speed"]
+
+
+# --- contacts -------------------------------------------------------------------------------------
+PAIR = (FEET[0], FEET[3])
+
+
+@pytest.fixture(scope="module")
+def walker(robot):
+    return replace(robot, constraints=(Contact(PAIR[0]), Contact(PAIR[1], "surface")))
+
+
+@pytest.fixture(scope="module")
+def walk(walker):
+    """Return a log in which the trunk drifts and the feet stand or swing in turn."""
+    t = np.arange(0.0, 6.0, 0.01)
+    q = np.zeros((len(t), 12))
+    swing = np.sin(2 * np.pi * 0.9 * t)  # both stand while it is 0: half of the time
+    for foot, sign in zip(PAIR, (1.0, -1.0), strict=True):
+        joint = walker.joints.index(f"{foot[:2]}_KFE")
+        q[:, joint] = np.maximum(sign * swing, 0.0)
+    still = pin.SE3(pin.rpy.rpyToMatrix(0.1, 0.2, 1.5), np.ones(3))
+    pose = np.tile(pin.SE3ToXYZQUAT(still), (len(t), 1))
+    contacts = {foot: q[:, walker.joints.index(f"{foot[:2]}_KFE")] == 0.0 for foot in PAIR}
+    return Log(t, q, 0 * q, walker.joints, base=BaseMotion(pose), contacts=contacts)
+
+
+def test_a_clean_walk_has_no_finding(walker, walk):
+    assert not list(check_base(walker, walk, RAW))
+
+
+def test_each_contact_has_its_own_speed_whatever_is_before_it(walker, walk):
+    """A surface before a point; both feet stand always, and the trunk slides and turns."""
+    contacts = [Contact(PAIR[1], "surface", always=True), Contact(PAIR[0], always=True)]
+    other = replace(walker, constraints=tuple(contacts))
+    t, pose = walk.t, walk.base.pose.copy()
+    pose[:, 0] += 0.3 * np.sin(2 * t)
+    log = replace(walk, q=0 * walk.q, base=BaseMotion(pose), contacts={})
+    found = list(check_base(other, log, RAW))
+    assert [f.code for f in found] == ["moving_contact"] * 2
+    speed = np.sqrt(np.mean(np.gradient(pose[:, 0], t) ** 2))
+    assert [f.evidence["speed"] for f in found] == pytest.approx([speed] * 2, rel=1e-3)
+    for foot, f in zip(PAIR[::-1], found, strict=True):
+        assert f"the link {foot} moves at {speed:.2g} m/s (RMS) while it is in contact" in f.message
+
+
+@pytest.fixture(scope="module", params=[0.7, 2.3])
+def ball(walker, request):
+    """Return a log of a robot that rolls on one foot, a ball of 25 mm, and lifts it at times."""
+    t = np.arange(0.0, 6.0, 0.01)
+    angle = 0.3 * np.sin(2.0 * t)
+    height = np.maximum(np.sin(5.0 * t) - 0.8, 0.0)
+    data = walker.pin_model.createData()
+    pin.framesForwardKinematics(walker.pin_model, data, pin.neutral(walker.pin_model))
+    centre = data.oMf[walker.pin_model.getFrameId(PAIR[0], pin.FrameType.BODY)].translation
+    pose = []
+    for x, lift in zip(angle, height, strict=True):
+        turned = pin.rpy.rpyToMatrix(0.0, x, request.param) @ pin.rpy.rpyToMatrix(0.5 * x, 0.0, 0.0)
+        pose.append(pin.SE3ToXYZQUAT(pin.SE3(turned, -turned @ centre + [0, 0, lift])))
+    log = Log(t, np.zeros((len(t), 12)), np.zeros((len(t), 12)), walker.joints,
+              base=BaseMotion(np.array(pose)), contacts={PAIR[0]: height == 0.0})  # fmt: skip
+    motion = process(log, replace(RAW, velocity="differentiated", acceleration="differentiated"))
+    R = np.array([pin.XYZQUATToSE3(x).rotation for x in log.base.pose])
+    w = np.einsum("kij,kj->ki", R, motion.v[:, 3:6])
+    pace = 0.025 * np.cross(w, [0.0, 0.0, 1.0])
+    way = np.cumsum(0.5 * (pace[1:] + pace[:-1]), axis=0) * 0.01
+    moved = log.base.pose.copy()
+    moved[1:, :3] += way
+    return replace(log, base=BaseMotion(moved))
+
+
+def test_the_radius_of_a_rolling_foot_is_found(walker, ball):
+    def found(radius):
+        contacts = (Contact(PAIR[0], radius=radius),)
+        return list(check_base(replace(walker, constraints=contacts), ball, RAW))
+
+    (finding,) = found(0.0)
+    assert finding.code == "rolling_contact"
+    assert finding.evidence["radius"] == pytest.approx(0.025, rel=0.02)
+    assert finding.evidence["after"] < 0.1 * finding.evidence["before"]
+    assert "State radius = 0.025" in finding.message
+    (finding,) = found(0.01)
+    assert finding.evidence["radius"] == pytest.approx(0.025, rel=0.02)
+    assert not found(0.025)
+
+
+# --- measured forces ------------------------------------------------------------------------------
+PARTS = ("fx", "fy", "fz")
+
+
+@pytest.fixture(scope="module")
+def stander(robot):
+    return replace(robot, constraints=tuple(Contact(foot, measured=PARTS) for foot in FEET))
+
+
+@pytest.fixture(scope="module")
+def steps(stander):
+    """Return a log with forces of a robot on its feet whose bodies differ from the URDF's."""
+    rng = np.random.default_rng(3)
+    other = with_other_bodies(stander, rng)
+    motion = stand(stander, np.tile([0.0, 0.8, -1.6], 4), 0.25, rng, parts=2)
+    return recorded(
+        other, other.standard_parameters(), motion, rng, rate=80.0, duration=6.0,
+        acceleration=False,
+    )  # fmt: skip
+
+
+def wrench_findings(model, steps):
+    return list(check_wrenches(model, steps.name, process(steps, SLOW)))
+
+
+def caused_and_left(model, steps):
+    """Return J^T f and W pi, shape (N, n_rows)."""
+    motion, whole = process(steps, SLOW), np.ones((1, len(FEET)), dtype=bool)
+    torque = predict(replace(model, constraints=()), [model.standard_parameters()], motion)[0]
+    J = constraint_jacobian(model, motion.q, np.repeat(whole, len(motion.t), axis=0))
+    return np.einsum("kmj,km->kj", J, motion.wrenches), torque
+
+
+def unexplained(model, steps, factor=1.0):
+    """Return the RMS force of W pi - factor J^T f of the base."""
+    caused, torque = caused_and_left(model, steps)
+    return np.sqrt(np.mean(np.sum((torque - factor * caused)[:, :3] ** 2, axis=1)))
+
+
+def times(steps, factor):
+    return replace(steps, wrenches={x: factor * y for x, y in steps.wrenches.items()})
+
+
+def test_right_forces_have_no_finding(stander, steps):
+    assert not list(check_base(stander, steps, SLOW))
+
+
+@pytest.mark.parametrize(
+    ("size", "words", "factor"),
+    [
+        (-1.0, "their sign is reversed", -1.0),
+        (1e-3, "another unit, kN", 1e3),
+        (1 / 9.81, "another unit, kgf", 9.81),
+        (0.2, "another unit. Correct", 5.0),
+    ],
+)
+def test_a_fault_of_the_columns_is_named(stander, steps, size, words, factor):
+    wrong = times(steps, size)
+    (finding,) = wrench_findings(stander, wrong)
+    assert (finding.code, finding.severity) == ("measured_wrench", "error")
+    assert words in finding.message
+    assert finding.evidence["factor"] == pytest.approx(factor, rel=0.2)
+    assert finding.evidence["best"] < 0.3 * 2.5 * 9.81  # what masses of the URDF leave
+    assert finding.evidence["force"] == pytest.approx(unexplained(stander, wrong))
+    caused, left = (x[:, :6] for x in caused_and_left(stander, wrong))
+    if factor > 1.0:  # least squares of force and moment together
+        factor = np.sum(caused * left) / np.sum(caused**2)
+    assert finding.evidence["factor"] == pytest.approx(factor)
+    assert finding.evidence["best"] == pytest.approx(unexplained(stander, wrong, factor))
+
+
+def test_vertical_forces_alone_show_their_sign(stander, steps):
+    contacts = [Contact(foot, "point", ("fz",)) for foot in FEET]
+    model = replace(stander, constraints=tuple(contacts))
+    vertical = replace(
+        steps, wrenches={f"fz {foot}": steps.wrenches[f"fz {foot}"] for foot in FEET}
+    )
+    assert not wrench_findings(model, vertical)
+    (finding,) = wrench_findings(model, times(vertical, -1.0))
+    assert "their sign is reversed" in finding.message

@@ -4,11 +4,11 @@ import copy
 import json
 import math
 import re
-from html import escape, unescape
+from html import escape
 
 import numpy as np
 import pytest
-from helpers.pages import number, percent, tables
+from helpers.pages import tables
 from helpers.paths import ROOT, URDF
 from helpers.synthetic import exact_log, truth
 
@@ -50,20 +50,6 @@ def changed(folder, tmp_path):
         return compare_results([folder / "a.json", tmp_path / "b.json"])
 
     return compare
-
-
-def test_differences_are_in_combined_standard_errors(folder):
-    a, b = (read_result(folder / f"{name}.json") for name in "ab")
-    found = compare_results([folder / "a.json", folder / "b.json"])
-    assert len(found["base_parameters"]) == len(a["base_parameters"])
-    shown = {entry["name"]: entry for entry in found["base_parameters"]}
-    for one, other in zip(a["base_parameters"], b["base_parameters"], strict=True):
-        entry = shown[one["name"]]
-        s = math.sqrt(one["std_error"] ** 2 + other["std_error"] ** 2)
-        assert entry["differences"] == [pytest.approx((other["value"] - one["value"]) / s)]
-        assert entry["values"] == [one["value"], other["value"]]
-    sizes = [abs(entry["differences"][0]) for entry in found["base_parameters"]]
-    assert sizes == sorted(sizes, reverse=True)
 
 
 def test_another_recording_is_not_compared(changed):
@@ -111,45 +97,17 @@ def test_the_command_prints_a_table_or_one_json_object_and_writes_the_page(
     assert "at least two results" in capsys.readouterr().err
 
 
-def test_the_page_shows_the_figures_of_the_two_results(folder, tmp_path):
-    a, b = (read_result(folder / f"{name}.json") for name in "ab")
-    b = copy.deepcopy(b)
+def test_parameters_far_apart_stand_first_and_are_counted(folder, tmp_path):
+    a, b = (copy.deepcopy(read_result(folder / f"{name}.json")) for name in "ab")
     last = b["base_parameters"][-1]
-    last["value"] += 4 * math.hypot(last["std_error"], a["base_parameters"][-1]["std_error"])
+    last["value"] -= 40 * math.hypot(last["std_error"], a["base_parameters"][-1]["std_error"])
     write_json(b, tmp_path / "b.json")
     write_comparison([folder / "a.json", tmp_path / "b.json"], tmp_path / "c.html")
     html = (tmp_path / "c.html").read_text(encoding="utf-8")
-    shown = tables(html)
-    (kept,) = [caption for caption in shown if caption.endswith(": not fitted")]
-    assert kept.startswith("second.csv 0-")
-    for caption, parts in (
-        (kept, [r["validation"][0] for r in (a, b)]),
-        ("Fitted samples of each result", [r["identification"] for r in (a, b)]),
-    ):
-        for row in shown[caption].rows:
-            one, other = (part["per_joint"][row[0]] for part in parts)
-            errors = [percent(x["relative_error_pct"]) for x in (one, other)]
-            rmse = [number(x["rmse"], ".3g") for x in (one, other)]
-            assert row[1:] == [*errors, *rmse, one["unit"]]
-        heads = ["joint", "A %", "B %", "A RMSE", "B RMSE", "unit"]
-        assert shown[caption].headers == heads
-        apart = [
-            abs(np.subtract(*(p["per_joint"][row[0]]["relative_error_pct"] for p in parts)))
-            for row in shown[caption].rows
-        ]
-        assert apart == sorted(apart, reverse=True)
-    table = shown["Base parameters ± standard errors"]
-    assert table.headers == ["parameter", "(B − A) / s", "A", "B", "unit"]
+    table = tables(html)["Base parameters ± standard errors"]
     assert table.rows[0][0] == last["name"]
-    assert {row[0] for row in table.rows} == {entry["name"] for entry in b["base_parameters"]}
     far = sum(abs(float(row[1].replace("−", "-"))) > 3.0 for row in table.rows)
     assert f"{far} of {len(table.rows)} parameters differ from A by more than 3 combined" in html
-    settings = dict((row[0], row[1:]) for row in shown["Different settings"].rows)
-    assert settings["estimator.name"] == ["consistent", "wls"]
-    for label, name, result in (("A", "a.json", a), ("B", "b.json", b)):
-        box = html.split(f"<p>{label} {name}: <strong>")[1].split("</div>")[0]
-        reasons = [unescape(reason) for reason in re.findall(r"<li>(.*?)</li>", box)]
-        assert reasons == result["verdict"]["reasons"]
 
 
 def test_results_and_logs_of_one_name_are_told_apart_by_the_shortest_path(folder, tmp_path):
