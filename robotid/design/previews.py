@@ -38,7 +38,7 @@ from robotid.dynamics.torque import predict, predict_instants
 from robotid.estimation.estimators import Estimate
 from robotid.estimation.estimators.batch import LEAST_NOISE, solve_factor
 from robotid.estimation.estimators.determination import base_spread, determine
-from robotid.estimation.estimators.estimator import FEWEST_SEGMENTS, scatter
+from robotid.estimation.estimators.estimator import FEWEST_SEGMENTS, LEAST_FREEDOM, scatter
 from robotid.estimation.fitting.estimator_settings import (
     ConsistentSettings,
     EstimatorSettings,
@@ -70,7 +70,6 @@ FAINTEST = 1e-3
 #: Typical weight of a consistent fit's prior with "auto", and the plausible weight: the largest one
 #: that held-out segments do not reject, for robots that differ from their URDF as much.
 _WEIGHT = (10.0, 1.0)
-_LEAST_FREE = 0.1  # smallest share of residual degrees of freedom in a joint's samples
 _IMPULSE = 40.0  # periods of the filter after which its impulse response is 0
 
 
@@ -195,7 +194,7 @@ class Run:
                 ratio = np.log(scattered[counts] / own[counts])
                 inflation[j] = np.exp(np.average(ratio, weights=share[counts]))
         effective = factors.leverages(bread) / sigma**2  # degrees of freedom
-        free = np.maximum(1.0 - effective / np.maximum(factors.rows, 1), _LEAST_FREE)
+        free = np.maximum(1.0 - effective / np.maximum(factors.rows, 1), LEAST_FREEDOM)
         # its density is sigma^2 inflation step, whatever its standard deviation is
         return TorqueNoise(
             sigma / np.sqrt(free), free * inflation * self.step, ("found",) * len(sigma)

@@ -82,6 +82,8 @@ AGREES = 0.05
 DIFFERS = 2 * AGREES
 #: Factor beyond which a torque or a total mass is no error of the URDF's masses.
 NO_ERROR_OF_MASSES = 3.0
+#: Ratio of the residuals of two explanations below which the first is clearly the better one.
+BETTER = 0.5
 SCATTERED = 3  # Segments from which a scatter is determined
 NOTHING = 1e-300  # A sum of squares that is 0, as a divisor
 Option = TypeVar("Option", bound=Hashable)

@@ -19,6 +19,7 @@ from robotid.base.typing import Array, real_numbers
 from robotid.data.base_motion import GAP_STEPS
 from robotid.data.log import Log, Trajectory
 from robotid.data.signals import GAP_CYCLES
+from robotid.diagnosis.decisions import BEYOND_NOISE
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import Sample
 from robotid.dynamics.rows import sure_rows
@@ -119,7 +120,7 @@ _MEMORY = 5.0  # time over which the noise level of each joint is averaged [s]
 _FIRST_NOISE = 0.1  # initial noise level, relative to the RMS torque of each row
 _SMALLEST_NOISE = 1e-4  # smallest noise level, relative to the RMS torque of each row
 _PSEUDO = 20.0  # weight of the initial noise level [samples]
-_CLIP = 9.0  # largest squared innovation in the noise level [variances]
+_CLIP = BEYOND_NOISE**2  # largest squared innovation in the noise level [variances]
 _CONVERGED = 0.25  # variance of the prediction over that of the noise, below which it has converged
 
 

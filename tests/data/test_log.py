@@ -88,6 +88,7 @@ FAULTS = [
     (dict(joints="ab"), "joints is 'ab', wanted at least one name in a tuple"),
     (dict(joints=()), "joints is (), wanted at least one name in a tuple"),
     (dict(has_torque=False), "has_torque is False, but tau is not 0; leave has_torque out, or"),
+    (dict(has_torque=False, tau=spoil(np.zeros((500, 2)), (3, 1), 1.0)), "but tau is not 0"),
 ]  # fmt: skip
 
 

@@ -120,6 +120,21 @@ def test_a_search_near_the_limits_continues_beyond_them_and_a_stalled_one_restar
         assert np.array_equal(after.iterate, C) == continues
 
 
+def test_the_search_is_given_the_slope_of_what_it_minimises(designer, rng, monkeypatch):
+    C, slopes = designer.random(rng), []
+
+    def minimize(cost, x, **_options):
+        D, h = rng.standard_normal(x.size), 1e-6
+        slopes.append((cost(x)[1] @ D, (cost(x + h * D)[0] - cost(x - h * D)[0]) / (2 * h)))
+        raise designs._OutOfTime
+
+    monkeypatch.setattr("scipy.optimize.minimize", minimize)
+    state = State(C, designer._objective(C), C, Multipliers(0.1))
+    assert list(designer._search(state, 2e-3, lambda: False)) == [state]
+    ((slope, expected),) = slopes
+    assert slope == pytest.approx(expected, rel=1e-4)
+
+
 @pytest.fixture(scope="module")
 def told(designer, design):
     """The information of a design and the prior's."""

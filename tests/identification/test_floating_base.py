@@ -182,7 +182,9 @@ def test_a_bias_of_the_accelerometers_is_estimated(go1, trot):
     assert 0.001 < sure < 0.01
     held = hold_log(go1, biased, SIGNALS)
     mapping, plain = structural_mapping(go1), replace(biased, base=BaseMotion(biased.base.pose))
-    once = with_repeated_errors(Recordings(go1, mapping, [held]))
+    once = with_repeated_errors(Recordings(go1, mapping, [held], [held]))
+    for log in (*once.fitted, *once.validation):  # both are read with this bias
+        np.testing.assert_array_equal(log.windows[0].base.imu.frame.offset, once.repeated.bias)
     both = Recordings(go1, mapping, [held, hold_log(go1, plain, SIGNALS)])  # one without an IMU
     np.testing.assert_allclose(with_repeated_errors(both).repeated.bias, bias, atol=0.015)
     again = with_repeated_errors(once).repeated  # of what is left: the whole bias is the same

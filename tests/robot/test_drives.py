@@ -117,6 +117,14 @@ def log_of(model, pi, rng):
                tau=predict(model, [pi], motion)[0])  # fmt: skip
 
 
+def test_only_what_physics_keeps_from_being_negative_is_bounded():
+    bounded = {term.name for term in (*TERMS.values(), *OWN) if term.is_nonnegative}
+    assert bounded == {
+        "armature", "viscous", "coulomb", "load", "tanh", "rise1", "presliding", "lugre",
+        "counterbalance",
+    }  # fmt: skip
+
+
 # What each term is, written down a second time: of w, dw/dt, sign w, angle and load.
 EXPECTED = {
     "armature": lambda m: m.a,

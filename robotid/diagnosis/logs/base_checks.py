@@ -15,7 +15,7 @@ from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import DIFFERS
+from robotid.diagnosis.decisions import AGREES, BETTER, DIFFERS
 from robotid.dynamics.constraint_rows import (
     constraint_jacobian,
     force_basis,
@@ -29,26 +29,24 @@ from robotid.robot.model import RobotModel
 
 _MOST = 1000  # samples at which poses and forces are compared
 _MOVES = 5e-3  # [m/s] speed of feet on the ground below which they are at rest
-# [m/s] RMS speed of a foot in contact that is reported above this share of its speed without
-# contact, or without rolling.
-_SLIDES, _STANDS = 0.1, 0.3
+_SLIDES = 0.1  # [m/s] RMS speed of a foot in contact above which it is reported ...
+_STANDS = 0.3  # ... if it is above this share of its speed without contact, or without rolling
 _LOADED = 0.1  # of the largest measured force: a foot with more is on the ground
 _ALIKE = (0.6, 1.6)  # factors of the forces that a wrong URDF explains
 _FORCE_UNITS = {"kN": 1e3, "kgf": 9.81}
-_SLOWER, _BETTER = 0.65, 0.5  # ratio of speeds below which another pose, of residuals another
-# twist or other forces explain the motion
-# A pose with another change must reduce the speed by this factor, plus this noise [m/s or rad/s],
-# the RMS value from which velocities are compared.
-_SIMPLER, _NOISE = 1.2, 1e-3
-# of the motion or weight: difference of a wrong velocity or force, of a velocity with a cause
-_UNLIKE, _SOME = 0.3, 0.05
+_SLOWER = 0.65  # ratio of speeds below which another pose explains the motion
+_SIMPLER = 1.2  # factor by which each further change of a pose must reduce the speed ...
+_NOISE = (
+    1e-3  # [m/s or rad/s] ... plus this noise, the RMS value from which velocities are compared
+)
+_UNLIKE = 0.3  # of the motion or weight: difference of a wrong velocity or force
 _DEGREES = np.pi / 180
 _UNITS = {"linear": ("mm/s", 1e-3), "angular": ("deg/s", _DEGREES)}
 _BACK = np.array([-1.0, -1.0, -1.0, 1.0])  # signs of the inverse quaternion
 _ABOVE = 0.3  # vertical distance of base and feet over their distance, from which one is above
 _ALONG = 0.8  # component of the unit vector from the feet to the base that may be the vertical
-# [s] over which the acceleration of a base is averaged; [m/s^2] RMS of it above which it is in mm
-_STRIDE, _FASTEST = 0.2, 30.0
+_STRIDE = 0.2  # [s] over which the acceleration of a base is averaged
+_FASTEST = 30.0  # [m/s^2] RMS value of it above which the position is in mm
 _IMU_MOVES = 0.1  # [rad/s] RMS from which angular velocities are compared
 _TILT = 8.0  # [deg] largest angle of the mean specific force from the vertical
 
@@ -124,7 +122,7 @@ def check_wrenches(model: RobotModel, log: str, motion: Trajectory) -> Iterator[
     if abs(factor + 1.0) < 1.0 - _ALIKE[0]:
         factor, what = -1.0, "reversed"
     stated, best = (rms((left - x * caused)[:, :3]) for x in (1.0, factor))
-    if stated > _UNLIKE * weight and best < _BETTER * stated:
+    if stated > _UNLIKE * weight and best < BETTER * stated:
         yield finding("measured_wrench", log, what=what, force=stated, best=best, factor=factor)
 
 
@@ -278,8 +276,8 @@ def check_twist(log: Log, signals: SignalSettings) -> Iterator[Finding]:
         causes["unit"] = rms(factor * twist[:, part] - wanted[:, part])
         turned = {key: rms((twist - x)[:, part]) for key, x in readings.items()}
         best, cause = min((left, key) for key, left in (causes | turned).items())
-        is_explained = best < _BETTER * off
-        if size < _NOISE or off < (_SOME if is_explained else _UNLIKE) * size:
+        is_explained = best < BETTER * off
+        if size < _NOISE or off < (AGREES if is_explained else _UNLIKE) * size:
             continue
         figures: dict[str, Any] = {"size": size, "best": best, "what": what, "unit": unit}
         if is_explained and cause in turned:
@@ -291,7 +289,7 @@ def check_twist(log: Log, signals: SignalSettings) -> Iterator[Finding]:
         yield finding(
             "base_twist", log.name, cure=cause if is_explained else "unknown", off=off,
             mixed=is_explained and cause == "world"
-            and axes[other]["logged"] < _BETTER * axes[other]["world"],
+            and axes[other]["logged"] < BETTER * axes[other]["world"],
             other=other, logged_unit=logged_unit, off_world=axes[what]["world"], **figures,
         )  # fmt: skip
 
@@ -429,7 +427,7 @@ def _check_gyroscopes(log: Log, motion: Trajectory) -> Iterator[Finding]:
             speed=now, best=readings[key],
         )  # fmt: skip
         return
-    cure = "degrees" if degrees < _BETTER * now else "unknown"
+    cure = "degrees" if degrees < BETTER * now else "unknown"
     yield finding("imu_axes", log.name, off=now / size, best=min(degrees, now) / size, cure=cure)
 
 

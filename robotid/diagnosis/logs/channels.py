@@ -22,27 +22,28 @@ MOVING = 0.1  # Share of the log in which a joint must move
 ZERO = 0.05  # Share of its largest value, below which a torque that is never negative is 0
 _LEAST = {"q": STATIC, "dq": AT_REST}  # [rad or m, rad/s or m/s] smaller values: at rest
 _LEAST_TORQUE = 0.01  # share of the median joint's torque below which a torque is negligible
-_SPIKE, _BEYOND = 15.0, 1.5  # distance of a spike, over the typical one and over the amplitude
-# A spike that is no motion is above this times the amplitude; with this share of the energy of its
-# channel it ruins a least-squares fit.
-_ABSURD, _HARM = 5.0, 0.02
+_SPIKE = 15.0  # distance of a spike over the typical one ...
+_BEYOND = 1.5  # ... and over the amplitude
+_ABSURD = 5.0  # ... above which it is no motion
+_HARM = 0.02  # share of the energy of its channel with which it ruins a least-squares fit
 _NOISY = 0.3  # noise over signal from which a torque is uninformative
 _LAG = 0.002  # [s] a shorter lag is not reported
 _ALIKE = 0.8  # least correlation of a velocity with the derivative of its position
-_ENCODER, _BITS = 0.01, range(9, 24)  # of encoders; difference of a step from 2 pi / 2^bits [bits]
+_BITS = range(9, 24)  # of encoders
+_ENCODER = 0.01  # [bits] difference of a step from 2 pi / 2^bits
 _DEAD = 1e-3  # velocity over d(q)/dt below which the channel is constant
 _LONG = 0.05  # [s] a longer gap is a warning
-# [median steps] A shorter step is of rows that were stamped together, if more than this share of
-# the usual motion per row is in them.
-_BUNCHED, _CLOCK_ALIKE = 0.2, 0.3
+_BUNCHED = 0.2  # [mean steps] a shorter step is of rows that were stamped together ...
+_CLOCK_ALIKE = 0.3  # ... if more than this share of the mean motion per row is in them
 # [s] A longer rest at an end is reported; in a longer gap, a position that moves as in one step
 # shows that the clock was set.
 _PAUSE = 1.0
 _STALE = 0.05  # share of stale rows from which they are a warning
-# Motion after repeated rows, over that in as many rows before and after, at most so many of each.
-_CONTINUES, _AROUND = 0.15, 10
+_CONTINUES = 0.15  # motion after repeated rows, over that in as many rows before and after ...
+_AROUND = 10  # ... at most so many rows of each
 _HARDLY = {"rad": 0.2, "m": 0.05}  # smaller range: the joint hardly moves
-_PLATEAU, _CLIPPED = 5, 0.01  # consecutive rows, and share, at the limit of a clipped channel
+_PLATEAU = 5  # consecutive rows at the limit of a clipped channel ...
+_CLIPPED = 0.01  # ... and share of all rows
 _AWAY = 0.2  # of its largest value, above which a torque is not 0 any more
 _SEVERAL = 3  # torques without sign, and times that each reaches 0 and increases again, at least
 _REGULAR = 0.8  # share of holds of about one length that a quantised torque does not reach

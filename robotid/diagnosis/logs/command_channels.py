@@ -17,27 +17,31 @@ from robotid.diagnosis.logs.channels import runs_of
 from robotid.estimation.fitting.standard_errors import QUANTILE
 
 _SECONDS = 5.0  # [s] of the averaged spectra
-_COHERENT, _COHERENCE = 0.8, 0.999  # least of a frequency that is used, largest that is believed
+_COHERENT = 0.8  # least coherence of a frequency that is used ...
+_COHERENCE = 0.999  # ... and the largest that is believed
 _EXCITED = 1e-4  # least power of a command, over that of its strongest frequency
 _HALF_POWER = np.sqrt(0.5)  # response at the bandwidth of a loop, over the response at rest
 _RIPPLE = 5  # number of frequencies over which the size of a response is smoothed
 _DELAYS = np.arange(0.0, 0.2, 0.001)  # [s] grid of the delays
 _LONGEST = 0.5  # [s] longest delay, or lead, of the position
 _DETERMINED = 0.02  # [s] width of the range of delays below which a delay is determined
-# [rows] between updates of a command that is zero-order held; values of a smooth command, and rows
-# of a constant one that is intended
-_UPDATED, _MANY = 1.5, 20
+_UPDATED = 1.5  # [rows] between updates of a command that is zero-order held
+_MANY = 20  # values of a smooth command, and rows of a constant one that is intended
 _INTERVAL = 0.1  # [s] over which changes of commands are compared
-# Share of slow sweeps that a joint should follow: if its lag is known, and which sweeps are slow.
-_FOLLOWED, _STUCK = 0.5, 0.2
-_SLOW, _SWEEPS = 5.0, 4  # [lags] least duration of slow sweeps, and number to judge a joint by
+_FOLLOWED = 0.5  # share of slow sweeps that a joint should follow if its lag is known ...
+_STUCK = 0.2  # ... and if it is not, which tells what sweeps are slow
+_SLOW = 5.0  # [lags] least duration of slow sweeps ...
+_SWEEPS = 4  # ... and least number to judge a joint by
 _RESOLVED = 10.0  # least number of encoder steps in a sweep, and of rows per period
-_SETTLED, _CONSTANT = 0.5, 2.0  # [s] after its last change a command is constant; least total time
-# [rad or m] Motion under a constant command, and share of it that the other joints must explain.
-_DISTURBED, _EXPLAINED = 0.01, 0.7
-# Movements at one speed: share of rows at it above half of it, a sine has 0.43; relative difference
-# from the speed of the command; their number.
-_FLAT, _UNLIKE, _PULSES = 0.6, 0.2, 3
+_SETTLED = 0.5  # [s] after its last change a command is constant ...
+_CONSTANT = 2.0  # [s] ... and least total time of this
+_DISTURBED = 0.01  # [rad or m] least motion under a constant command ...
+_EXPLAINED = 0.7  # ... and share of it that the other joints must explain
+_FLAT = (
+    0.6  # of the rows above half of a speed: share near it of movements at one speed, a sine: 0.43
+)
+_UNLIKE = 0.2  # least relative difference of this speed from that of the command ...
+_PULSES = 3  # ... and least number of such movements
 
 
 def check_commands(log: Log, prismatic: Collection[str] = ()) -> Iterator[Finding]:

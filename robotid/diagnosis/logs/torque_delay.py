@@ -22,15 +22,16 @@ from robotid.diagnosis.logs.hypotheses import coupled_columns, smooth_motion
 from robotid.dynamics.rows import inertial_rows
 from robotid.robot.model import RobotModel
 
-_LONGEST, _NEAR = 0.1, 0.01  # [s] largest delay; width of the misfit's parabola around the delay
+_LONGEST = 0.1  # [s] largest delay
+_NEAR = 0.01  # [s] half-width of the misfit's parabola around the delay
 _GRID = np.linspace(-_LONGEST, _LONGEST, 81)
-_FINEST, _HELD = 0.001, 0.1  # apparent delay by unknown friction [s], and a held torque [samples]
-# [s] A longer delay must explain this share of the unexplained torque: other model errors look
-# like one, too.
-_DELAYED, _HELPS = 0.04, 0.15
+_FINEST = 0.001  # [s] apparent delay by unknown friction ...
+_HELD = 0.1  # [samples] ... and by a held torque
+_DELAYED = 0.04  # [s] a longer delay must explain ...
+_HELPS = 0.15  # ... this share of the unexplained torque: other model errors look like one, too
 _FEW = 100  # least number of rows of a joint that is used
-# [rad/s] slower: a drive may be in stiction; [periods of the filter] friction around is unknown
-_SLOW, _AWAY = 0.05, 0.75
+_SLOW = 0.05  # [rad/s] slower: a drive may be in stiction ...
+_AWAY = 0.75  # [periods of the filter] ... and its friction is unknown for this time around
 _BLOCKS = 8  # number of segments with these instants in a long log, and of blocks of the jackknife
 _OVERSAMPLED = 8.0  # instants per period of the filter: the regressor has a larger bandwidth
 # Cut-off of the comparison over the job's, and over the rate at most, since interpolation smooths

@@ -29,7 +29,8 @@ from robotid.estimation.fitting.fitted import Solution
 from robotid.robot.drive_term import DataRange, DriveMotion, DriveTerm, Family, MemorylessTerm
 from robotid.robot.drives import FAMILIES
 
-_GRID, _SPAN = 6, 100.0  # values of a shape that are tested; largest over smallest of them
+_GRID = 6  # values of a shape that are tested ...
+_SPAN = 100.0  # ... and the largest over the smallest of them
 _REVOLUTION = 2 * np.pi  # [rad]
 _STEPS = 40  # iterations of the search for all shapes of a joint together
 _LOADED = ("load", "lag")  # families that depend on the torque of the drive

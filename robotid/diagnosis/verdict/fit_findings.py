@@ -36,16 +36,15 @@ from robotid.robot.parameters import pseudo_inertia
 
 _BIASED = 0.5, 2.0  # shift of a parameter by encoder noise, in standard errors: note, warning
 _COARSE = 0.1  # share of encoder noise over the largest one, from which a joint is named
-# Of the URDF's smallest eigenvalue: below, a body is barely possible, if links on locked joints
-# have more than this share of its mass.
-_SHRUNK, _MUCH = 0.1, 0.2
+_SHRUNK = 0.1  # of the URDF's smallest eigenvalue: below, a body is barely possible ...
+_MUCH = 0.2  # ... if links on locked joints have more than this share of its mass
 _USER_BOUNDS = ("mass ", "total_mass ", "centre_of_mass ")
 _DENSEST = 12_000.0  # [kg/m^3] of a link: lead has 11,340
 _UNLIKELY = 0.05  # share of the bodies that the errors allow below which one is not possible
 _AT_BOUND = 1e-3  # relative difference of a mass from a stated bound that determines it
 _VANISHED = 0.05  # share of a link's URDF mass below which the link has practically vanished
-# Of the squared error, that a gain of the torque leaves; of friction, which may have changed, too.
-_LEFT, _MOSTLY = 1 / 3, 0.6
+_LEFT = 1 / 3  # largest share of the squared error that a gain of the torque leaves
+_MOSTLY = 0.6  # share of friction in a torque above which friction may have changed, too
 
 
 def fit_findings(

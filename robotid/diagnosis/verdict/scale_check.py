@@ -14,7 +14,7 @@ from robotid.base.findings import listed
 from robotid.base.tolerances import TINY
 from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import sentence_of
-from robotid.diagnosis.decisions import AGREES, DIFFERS
+from robotid.diagnosis.decisions import AGREES, BETTER, DIFFERS
 from robotid.dynamics.constraint_rows import loop_basis, without_forces
 from robotid.dynamics.torque import joint_torque_regressor, predict
 from robotid.estimation.fitting.fitted import Fit
@@ -26,9 +26,7 @@ _POSES = 300  # at which gravity is compared
 _LOADED = 0.02  # share of the largest gravity torque above which a joint is compared
 _HELD_BACK = 1.5  # residual over that of WLS beyond which the prior determines the result
 _ANOTHER = 0.35  # difference of gravity and total mass from which on they contradict the scale
-# Distance of a common factor from 1 over the share of gravity that it leaves, and largest ratio of
-# that share to the one that a payload leaves.
-_CLEARLY, _BETTER = 4.0, 0.5
+_CLEARLY = 4.0  # distance of a common factor from 1 over the share of gravity that it leaves
 _TOTAL = "total mass"
 _ABSORBS = 0.1  # share of a change of a stated mass that a link takes up to be named
 
@@ -213,7 +211,7 @@ class ScaleCheck:
         by_factor, by_payload = self.unexplained
         return (
             abs(self.factor - 1.0) > max(DIFFERS, _CLEARLY * by_factor)
-            and by_factor < _BETTER * by_payload
+            and by_factor < BETTER * by_payload
             and not self._is_urdf
         )
 
@@ -264,7 +262,7 @@ class ScaleCheck:
         is_like = self.scale is not None and abs(self.scale - 1.0) <= AGREES
         causes = {
             "factor": self.has_one_factor,
-            "load": is_like and self.masses[2] > 0 and by_payload < _BETTER * by_factor,
+            "load": is_like and self.masses[2] > 0 and by_payload < BETTER * by_factor,
             "single": bool(single),
             "prior": not self.follows,
             "masses": bool(beyond),

@@ -15,6 +15,7 @@ from robotid.base.exceptions import SettingsError
 from robotid.base.findings import Finding, listed, not_ignored, quoted
 from robotid.base.settings import require_kind
 from robotid.diagnosis.catalogue import codes_with, reason_of, sentence_of
+from robotid.diagnosis.decisions import BETTER
 from robotid.diagnosis.verdict.scale_check import ScaleCheck
 from robotid.estimation.fitting.evaluation import JointMetrics, Metrics, logs_that_test
 
@@ -30,7 +31,7 @@ COSTLY = 3.0  # [%] a larger error on the fitted logs, twice that of WLS, makes 
 #: gives no warning of a missing drive term.
 SMALL = 5.0
 _HARMLESS = 1.0  # [%] of the torque, below which an error gives no warning
-_MUCH = 2.0  # ratio of two errors, or of two gravity torques, that is no chance
+_MUCH = 1 / BETTER  # ratio of two errors, or of two gravity torques, that is no chance
 _BASE = "base."  # of the rows of a floating base
 NAMED = 8  # Parameters, joints or places that a sentence names
 _NOT_VERIFIED = "not verified, no validation log"

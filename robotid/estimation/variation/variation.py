@@ -22,7 +22,7 @@ from robotid.estimation.variation.spread import (
 SCORES = np.linspace(-3.5, 3.5, 15)  # of the quantiles in result.json
 FALSE_ALARMS = 0.02  # probability that one of alike runs or units is named
 _LEAST_SHRUNK = 1e-3  # smallest share of the shrinkage: the correlation has an inverse
-_SCALE = 0.1  # smallest plausible standard deviation between units, over the parameter's size
+PLAUSIBLE = 0.1  # standard deviation between units or logs over the value, before the data
 _SPREADS = 32  # standard deviations between units over which a test is integrated
 _RANGE = 0.05, 30.0  # their range, over the smallest standard error, over the scatter
 
@@ -195,7 +195,7 @@ def between_units(
     if len(left) < FEWEST_RUNS:
         return None
     x, errors = values[left], std_errors[left]
-    scale = max(_SCALE * abs(np.median(x)), np.median(errors), np.std(x, ddof=1))
+    scale = max(PLAUSIBLE * abs(np.median(x)), np.median(errors), np.std(x, ddof=1))
     H = errors[:, None, None] ** -2.0
     one = np.zeros(len(left), dtype=int)  # a unit has one estimate here: it is the lowest level
     model = SpreadModel(Runs(H, H[:, 0] * x[:, None], one, np.array([scale])))

@@ -9,6 +9,7 @@ import numpy as np
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import Finding, by_severity, listed, quoted
+from robotid.base.tolerances import LEAST_DIVISOR
 from robotid.base.typing import Array, ProgressCallback, ignore_progress, report_stage
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
@@ -29,7 +30,7 @@ from robotid.estimation.fitting.fitted import FROM_PRIOR, sources_of
 from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.estimation.variation.groups import FEWEST_RUNS, Group, RunsOf, inflation_of
 from robotid.estimation.variation.spread import Runs
-from robotid.estimation.variation.variation import vary
+from robotid.estimation.variation.variation import PLAUSIBLE, vary
 from robotid.identification.closed_loop.initial_values import CLEAR, parallel_axes
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.loop_simulator import (
@@ -54,8 +55,7 @@ from robotid.robot.drives import TERMS, Spring
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
-_CHANGE = 0.1  # plausible standard deviation of a parameter between logs, over its value
-_LEAST = 0.01  # ... at least, over its prior standard deviation
+_LEAST = 0.01  # plausible change between logs, at least, over the prior standard deviation
 _CAUTIONS = ("at_bound", "coarse_steps", "gains_contradicted")  # with these no result is good
 _MOVING = 0.05  # smallest speed above the noise, relative to the largest speed of a joint
 _MISMATCH = 0.5  # largest relative error of a torque that the loop of its joint gives
@@ -310,7 +310,7 @@ def loop_runs(
         members = [simulator.free_parameters[k] for k in places]
         centre, spread = estimate.theta[places], simulator.prior_std[places]
         spread = np.where(np.isfinite(spread), spread, 0.0)
-        scale = np.maximum(_CHANGE * np.abs(centre), np.maximum(_LEAST * spread, 1e-12))
+        scale = np.maximum(PLAUSIBLE * np.abs(centre), np.maximum(_LEAST * spread, LEAST_DIVISOR))
         group = Group(
             "drive", members[0].name.rpartition(".")[0], tuple(free.name for free in members),
             tuple(units_of(model, free) for free in members), np.zeros((0, len(members))),

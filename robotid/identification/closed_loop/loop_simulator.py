@@ -18,7 +18,7 @@ from robotid.base.exceptions import NotConvergedError
 from robotid.base.tolerances import SLACK
 from robotid.base.typing import Array
 from robotid.data.signals import local_polynomial
-from robotid.diagnosis.decisions import BEYOND_NOISE, SIMULATED_FAMILY, Round
+from robotid.diagnosis.decisions import AGREES, BEYOND_NOISE, SIMULATED_FAMILY, Round
 from robotid.dynamics.simulation.loops import (
     ClosedLoopRobot,
     Column,
@@ -55,7 +55,6 @@ _ENTRIES = ((3, 3), (0, 3), (1, 3), (2, 3))
 _OFFERED = ("stribeck", "load", "position")  # candidate families of friction terms
 _SLOW = 0.3  # Stribeck speed of candidates, over the typical speed of the joint
 _WIDE = 0.05  # smallest half-range of a position-dependent candidate [rad or m]
-_LARGE = 0.05  # smallest relevant difference of a scale; missing friction terms cause smaller ones
 
 _log = logging.getLogger(__name__)
 
@@ -661,7 +660,8 @@ class GainScale:
         """Whether the common factor of all gains is not 1, and each joint is consistent with it."""
         error = np.hypot(self.error, self.common_error)
         agree = np.abs(self.change - self.common) <= BEYOND_NOISE * error
-        is_other = abs(self.common) > max(BEYOND_NOISE * self.common_error, _LARGE)
+        # missing friction terms cause smaller differences
+        is_other = abs(self.common) > max(BEYOND_NOISE * self.common_error, AGREES)
         return bool(is_other and agree.all())
 
 

@@ -174,6 +174,8 @@ def test_rows_that_are_too_few_for_the_bandwidth_are_named():
     assert finding.severity == "warning"
     assert finding.evidence["rate"] == pytest.approx(20.0)
     assert finding.evidence["bandwidth"] == pytest.approx(3.0, abs=0.7)
+    assert finding.evidence["rows"] == pytest.approx(20.0 / finding.evidence["bandwidth"])
+    assert finding.evidence["wanted"] == pytest.approx(10.0 * finding.evidence["bandwidth"])
 
 
 @pytest.mark.parametrize("early", [0.02, 0.1])

@@ -73,6 +73,16 @@ def test_torques_that_no_physics_explains_have_no_scale(ur5, ur5_log):
         assert found == ("unexplained_torque", "run.csv")
 
 
+def test_each_torque_that_no_physics_explains_has_its_own_share(ur5, ur5_log):
+    tau = ur5_log.tau.copy()
+    std = tau[:, [1, 2]].std(axis=0)
+    tau[:, [1, 2]] += np.random.default_rng(0).standard_normal((len(tau), 2)) * std * [2.0, 4.0]
+    findings = diagnose(ur5, [replace(ur5_log, tau=tau)], [], SIGNALS)
+    found = {f.joints: f.evidence["share"] for f in findings if f.code == "unexplained_torque"}
+    wanted = {("shoulder_lift_joint",): 0.5, ("elbow_joint",): 0.8}  # of the variance
+    assert found == pytest.approx(wanted, abs=0.1)
+
+
 @pytest.mark.parametrize("value", [0.0, 3.0])
 def test_a_dead_torque_does_not_make_others_suspect(ur5, ur5_log, value):
     tau = ur5_log.tau.copy()

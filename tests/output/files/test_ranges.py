@@ -25,6 +25,7 @@ from robotid.output.files.ranges import (
     projected_ranges,
     ranges_text,
     sample,
+    stated_ranges,
 )
 from robotid.output.files.result_file import load_result
 from robotid.robot.drives import Stribeck
@@ -316,6 +317,16 @@ def test_drives_of_commands_have_no_sample_below_zero(tmp_path):
         drawn = values[:, every.index(name)]
         assert drawn.min() >= 0.0
         assert np.std(drawn) > 0.5 * free[name]
+
+
+def test_a_gain_that_varies_between_logs_has_no_range_below_zero(tmp_path):
+    result = load_result(written_result(plant("planar", np.random.default_rng(0)), tmp_path / "r"))
+    gain = next(e for e in result.content["drive_parameters"] if e["name"].endswith(".kp"))
+    changed = {"drive_parameters": [{**gain, "std_error": 1.0}],
+               "variation": {"parameters": {gain["name"]: {"next_interval": [-1.0, 40.0]}}}}
+    drive = gain["name"].removesuffix(".kp")
+    found = stated_ranges({**result.content, **changed})["drives"][drive]["kp"]
+    assert (found["low"], found["high"], found["source"]) == (0.0, 40.0, "logs")
 
 
 @pytest.mark.parametrize(("flags", "words"), [
