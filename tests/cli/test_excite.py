@@ -140,14 +140,8 @@ def test_every_flag_states_its_setting():
         "points": "50",
     }  # fmt: skip
     line = [word for name, value in words.items() for word in (f"--{name}", value)]
-    for flag in (
-        "--max-velocity",
-        "--max-torque",
-        "--max-acceleration",
-        "--max-jerk",
-        "--max-power",
-        "--noise",
-    ):
+    limits = [f"--max-{x}" for x in ("velocity", "torque", "acceleration", "jerk", "power")]
+    for flag in (*limits, "--noise"):
         line += [flag, "one=3", flag, "two=0.5"]
     line += ["--box", "post=0,1,2,3,4,5", "--box", "wall=-1,0,0,0,1,1"]
     found = stated_by_flags(*line)
