@@ -1,8 +1,4 @@
-"""Whatever is in a file, a setting or a result: robotid says what is wrong, and never how it broke.
-
-Each kind of input is tried for a few seconds with a fixed seed; ``benchmarks/bench_fuzz.py`` tries
-thousands.
-"""
+"""Whatever is in a file or a setting: robotid says what is wrong, and never how it broke."""
 
 import tempfile
 from pathlib import Path

@@ -1,7 +1,4 @@
-"""Arguments of another kind than a public function takes are refused in words, not by an accident.
-
-A wrong keyword stays Python's TypeError.
-"""
+"""Arguments of another kind are refused in words; a wrong keyword stays Python's TypeError."""
 
 import re
 from pathlib import Path

@@ -3,6 +3,9 @@
 #: Relative size of rounding errors of sums and products, and of the last step of an iteration whose
 #: result they limit.
 ROUNDING = 1e-12
+#: Size of a column, a coefficient or a residual over the largest, below which it is what rounding
+#: leaves of an elimination.
+REMAINDER = 1e-10
 #: A smaller divisor counts as this one: it is 0 but for rounding.
 LEAST_DIVISOR = 1e-12
 #: Relative violation of an inequality that is rounding: of bounds, of eigenvalues of a matrix that

@@ -13,7 +13,8 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from scipy.special import stdtr
 
-from robotid.base.tolerances import TINY as TINY  # of this package's tests, too
+from robotid.base.tolerances import REMAINDER
+from robotid.base.tolerances import TINY as TINY
 from robotid.base.typing import Array
 
 
@@ -71,8 +72,7 @@ OUTLIER = 12.0  # Typical residuals above which a sample is excluded
 BEYOND_NOISE = 3.0  # Standard errors, or deviations, beyond which a value is no noise
 SHARE_OF_ROWS = 0.02  # Share of the rows from which a fault of single rows is reported
 ROWS = 2000  # Instants of a motion that are used: more are not independent after the filter
-#: Share of a column below which it is rounding, and relative step of a derivative by a shape.
-ROUNDING, STEP = 1e-10, 1e-3
+STEP = 1e-3  # Relative step of a derivative by a shape
 #: Size of the correlation from which two parameters or signals are strongly correlated: if one were
 #: known, the error of the other would be less than a third of what it is, sqrt(1 - r^2) = 0.31.
 CORRELATED = 0.95
@@ -158,7 +158,7 @@ def p_value(before: Array, after: Array, fitted: int) -> float:
 
 def _student(before: Array, after: Array) -> float:
     """Return the p-value of the mean share; 1 for too few segments."""
-    moves = before > ROUNDING * before.max(initial=0.0)  # else the joint is at rest in the segment
+    moves = before > REMAINDER * before.max(initial=0.0)  # else the joint is at rest in the segment
     if moves.sum() < SCATTERED:
         return 1.0
     gain = (before - after)[moves] / np.maximum(before, after)[moves]

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg
 
 from robotid.base.exceptions import DataError
-from robotid.base.tolerances import LEAST_DIVISOR, SINGULAR, TINY
+from robotid.base.tolerances import LEAST_DIVISOR, REMAINDER, SINGULAR, TINY
 from robotid.base.typing import Array
 from robotid.dynamics.factors import Problem, triangle_of
 from robotid.dynamics.torque import random_regressor
@@ -20,7 +20,6 @@ from robotid.robot.model import RobotModel
 #: Pivots below this share of the largest count as 0. Over example-robot-data, every pivot is above
 #: 1e-3 or below 1e-12, except with rounded angles in a URDF (3.1416): 1e-5 to 1e-6.
 RANK_TOLERANCE = 1e-4
-_CLEAN = 1e-10  # smaller coefficients, relative to the scales, are rounding errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +95,7 @@ def base_mapping(
     own, others = np.sort(order[:rank]), np.sort(order[rank:])
     triangle = triangle_of(R[:, np.append(own, others)])[:rank]
     X = scipy.linalg.solve_triangular(triangle[:, :rank], triangle[:, rank:])  # scaled
-    X[np.abs(X) < _CLEAN] = 0.0
+    X[np.abs(X) < REMAINDER] = 0.0
     K = np.zeros((rank, len(names)))
     K[np.arange(rank), own] = 1.0
     K[:, others] = X * magnitude[own][:, None] / magnitude[others]
@@ -157,7 +156,7 @@ def _with_own_terms(model: RobotModel, plain: BaseMapping) -> BaseMapping:
     K = np.zeros((len(base) + rank, len(names)))
     K[: len(base), place] = plain.K
     K[len(base) + np.arange(rank), own[first]] = 1.0
-    K[: len(base), own[rest]] = np.where(np.abs(A) < _CLEAN, 0.0, A) * size[rest]
+    K[: len(base), own[rest]] = np.where(np.abs(A) < REMAINDER, 0.0, A) * size[rest]
     K[len(base) :, own[rest]] = B * size[rest] / size[first][:, None]
     independent = np.concatenate([base, own[first]])
     ascending = np.argsort(independent)

@@ -1,7 +1,6 @@
 """`robotid payload` and `robotid preview`: what a result and further logs determine."""
 
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -209,46 +208,6 @@ def test_the_window_of_a_job_is_previewed(files, capsys):
     (motion,) = json.loads(capsys.readouterr().out)["motions"]
     assert 2.0 <= motion["start"] < 2.6
     assert 6.4 < motion["end"] <= 7.0
-
-
-def test_a_run_before_says_what_gains_most(files, capsys):
-    words = [files / "loaded_motion.csv", "--given", files / "out"]
-    content = json.loads(previewed(capsys, *words, "--json"))
-    assert content["estimator"] == "wls"
-    assert {noise["is"] for noise in content["noise"].values()} == {"found"}
-    before, after, gain = (base(content, k) for k in ("std_error_before", "std_error", "gain"))
-    for name, factor in gain.items():
-        assert factor >= 1.0
-        assert factor <= before[name] / after[name] * 1.001
-    assert max(gain.values()) > 1.3
-    text = previewed(capsys, *words)
-    head, *rows = text.partition("spread\n")[2].splitlines()
-    assert head.split() == ["+-", "left", "before", "gain"]
-    for row, entry in zip(rows, content["base_parameters"], strict=False):
-        left = 100 * min(entry["std_error"] / entry["plausible"], 1)
-        figures = (f"{entry[key]:.2g}" for key in ("std_error_before", "gain"))
-        assert re.split(r" {2,}", row)[-3:] == [f"{left:.0f} %", *figures]
-    assert "assumed" not in text
-
-
-def test_what_was_achieved_stands_beside_what_was_expected(files, capsys):
-    words = [files / "bare.csv", "--given", files / "out"]
-    content = json.loads(previewed(capsys, *words, "--json"))
-    result = json.loads((files / "out" / "result.json").read_text())
-    achieved = base(content, "achieved_std_error")
-    assert achieved == {e["name"]: e["std_error"] for e in result["base_parameters"]}
-    ratio, expected = base(content, "ratio"), base(content)
-    for name, value in ratio.items():
-        assert value == pytest.approx(achieved[name] / expected[name])
-    assert content["achieved"]["count"] == len(ratio)
-    assert content["achieved"]["median"] == pytest.approx(1.0, abs=0.2)
-    assert content["achieved"]["median"] == pytest.approx(np.median([*ratio.values()]))
-    tenths = np.quantile([*ratio.values()], [0.1, 0.9])
-    assert content["achieved"]["range_80"] == pytest.approx(tenths)
-    for joint, noise in content["noise"].items():
-        assert noise["achieved"] == result["identification"]["per_joint"][joint]["rmse"]
-        assert noise["achieved"] == pytest.approx(noise["std"], rel=0.1)
-    assert "times the expected ones" in " ".join(previewed(capsys, *words).split())
 
 
 def test_wrong_words_are_answered(files, capsys):

@@ -32,12 +32,7 @@ def robot():
 
 
 def standing(robot, loaded):
-    """Return a log at rest, the forces upwards (N, 4), and the wrench left on the base (N, 6).
-
-    Args:
-        robot: The robot.
-        loaded: Whether each foot has a load, by sample, shape (N, 4); the others are lifted.
-    """
+    """Return a log at rest, upward forces of loaded feet (N, 4) and the base's wrench (N, 6)."""
     N, n = len(loaded), len(robot.joints)
     t = np.arange(N) / 100
     pose = np.zeros((N, 7))

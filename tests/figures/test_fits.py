@@ -8,20 +8,23 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.figure_runs import CURRENTS
-from helpers.hoist import (
-    INERTIAL,
-    Drive,
-    Hoist,
-    own,
-    parameters,
-    regressor_torque,
-    standardised,
-)
+from helpers.hoist import INERTIAL, Drive, Hoist, own, parameters, regressor_torque, standardised
+from helpers.stored import path_of
+
+from robotid.output.files.exports import formats
 
 
 @pytest.mark.parametrize("name", ["arm", "currents", "motors", "static"])
 def test_all_figures_are_those_that_are_stored(same, name):
     same(name)
+
+
+def test_every_format_of_exports_is_stored():
+    stored = {
+        **json.loads(path_of("arm").read_text()),
+        **json.loads(path_of("commands").read_text()),
+    }
+    assert {f"exported {kind}" for kind in formats()} <= stored.keys()
 
 
 def rms(x):

@@ -99,6 +99,12 @@ def arm(folder):
         runs.run(f"export {form}", f"export @out --format {form} --out @{file}")
         runs.keep(f"exported {form}", file)
     runs.run("preview --given", "preview @job.toml --given @out --verbose")
+    runs.run("achieved", "preview @job.toml --given @out --json")
+    achieved = runs.documents["achieved"]
+    for entry in achieved["base_parameters"]:
+        del entry["expression"]  # as in the result
+    runs.documents["achieved"] = {k: achieved[k] for k in ("achieved", "base_parameters", "noise")}
+    runs.run("preview of another log", "preview @hoist.urdf @later.csv --given @out --verbose")
     return runs, {"hoist": hoist, "logs": logs, "result": found}
 
 

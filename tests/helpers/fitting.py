@@ -1,7 +1,4 @@
-"""``identify`` for tests of fits: neither the doctor nor the choice of friction is asked.
-
-``fit`` is the fit alone, without what is concluded from it.
-"""
+"""``identify`` and ``fit`` for tests: neither doctor nor choice of friction is asked."""
 
 from robotid.cli.identify import identify as identify_all
 from robotid.data.signal_settings import SignalSettings

@@ -1,7 +1,4 @@
-"""A hoist of four joints and its recordings, from Pinocchio's RNEA and drives of its own.
-
-Nothing of the package is used: what a scenario is compared with is known from here alone.
-"""
+"""A hoist of four joints by Pinocchio's RNEA and drives of its own: nothing of the package."""
 
 import csv
 from dataclasses import asdict, dataclass, field

@@ -1,7 +1,4 @@
-"""Hostile inputs of excite, simulate, report, LeRobot datasets and the tables of drives in a job.
-
-As those of ``hostile_inputs``, whose ``KINDS`` these are beside.
-"""
+"""Hostile inputs of excite, simulate, LeRobot datasets and drives, as ``hostile_inputs``."""
 
 import json
 import shutil

@@ -1,7 +1,4 @@
-"""Hostile inputs of every kind, and what is done with each: a traceback is a failure.
-
-``tests/test_hostile_inputs.py`` tries some of each kind, ``benchmarks/bench_fuzz.py`` thousands.
-"""
+"""Hostile inputs: a traceback is a failure. ``benchmarks/bench_fuzz.py`` tries thousands."""
 
 import contextlib
 import copy
@@ -40,10 +37,7 @@ COLUMNS = ["time", *(f"{kind}_{joint}" for kind in ("q", "dq", "tau") for joint 
 
 
 def obey(*words, out=None):
-    """Run a command line: it ends in its own words, and what it leaves is whole or nothing.
-
-    ``out`` is the file, or the folder, that it writes to.
-    """
+    """Run a command line: it ends in its own words; out, file or folder, is whole or as before."""
     before = files_in(out)
     shown, error = io.StringIO(), io.StringIO()
     with (

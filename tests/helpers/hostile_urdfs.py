@@ -1,7 +1,4 @@
-"""Hostile URDFs of every kind, and what is done with each: a traceback is a failure.
-
-``tests/robot/test_model.py`` tries some, ``benchmarks/bench_fuzz.py`` thousands.
-"""
+"""Hostile URDFs of every kind, and what is done with each: a traceback is a failure."""
 
 import contextlib
 import json

@@ -40,10 +40,7 @@ def simulated(name):
 
 
 def states(model, pi, count):
-    """Yield random states of the tree, mimic joints by themselves, with its dynamics.
-
-    M has the drives' armature, and forces are those of bodies, armature and viscous friction.
-    """
+    """Yield random states of the tree: M has the drives' armature, forces their viscous part."""
     robot, rng = model.with_parameters(pi).pin_model, np.random.default_rng(5)
     data, first = robot.createData(), 6 if model.free_flyer else 0
     names = list(robot.names)[2 if first else 1 :]

@@ -108,10 +108,7 @@ def stand(model, middle, height, rng, *, parts=4, length=3.0, rate=100.0, size=1
 
 
 def on_feet(model, pose, q, contacts):
-    """Return the joint positions nearest to q with which feet on the ground do not move, (N, n).
-
-    A foot remains where it is at the first sample of its contact.
-    """
+    """Return the joint positions nearest to q, (N, n), at which feet stay where they touched."""
     pin_model, data = model.pin_model, model.pin_model.createData()
     ids = [frame_id(pin_model, x.frame) for x in model.contacts]
     found, change, places = np.empty_like(q), np.zeros(q.shape[1]), {}

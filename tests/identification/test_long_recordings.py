@@ -85,10 +85,7 @@ def _reasons(content):
 
 
 def leaves(value, place=""):
-    """Yield the values of JSON by place, of texts the words and the figures, which are rounded.
-
-    Bands and expected errors follow standard errors: pieces cut segments elsewhere.
-    """
+    """Yield values of JSON by place; no bands: they follow errors of segments cut elsewhere."""
     if isinstance(value, str):
         words = re.split(r"(\d+\.?\d*)", value)
         yield place, "#".join(words[::2])

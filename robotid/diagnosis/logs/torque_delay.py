@@ -10,13 +10,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from robotid.base.findings import Finding
+from robotid.base.tolerances import REMAINDER
 from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import low_pass
 from robotid.data.units import AT_REST
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import BEYOND_NOISE, ROUNDING, ROWS
+from robotid.diagnosis.decisions import BEYOND_NOISE, ROWS
 from robotid.diagnosis.logs.channels import MOVING, distance
 from robotid.diagnosis.logs.hypotheses import coupled_columns, smooth_motion
 from robotid.dynamics.rows import inertial_rows
@@ -256,7 +257,7 @@ def _squares(
 def _orthonormal(X: Array) -> Array:
     """Return an orthonormal basis of columns, (N, k), without those that are dependent."""
     length = np.linalg.norm(X, axis=0)
-    is_excited = length > ROUNDING * length.max()  # other columns are 0 except for rounding
+    is_excited = length > REMAINDER * length.max()  # other columns are 0 except for rounding
     X = X[:, is_excited] / length[is_excited]
     squares, V = np.linalg.eigh(X.T @ X)
     independent = squares > _EXACT**2 * squares[-1]

@@ -19,6 +19,7 @@ import numpy as np
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
+from robotid.base.tolerances import REMAINDER
 from robotid.base.typing import Array
 from robotid.diagnosis import decisions
 from robotid.diagnosis.decisions import Round, select
@@ -438,7 +439,7 @@ def _refined(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> list[_S
 
     def left(log_sizes: Array) -> float:
         columns = drive.columns(_terms(drive, sized(np.exp(log_sizes))))
-        whole = Trials(joined, columns[:, None], decisions.ROUNDING).whole
+        whole = Trials(joined, columns[:, None], REMAINDER).whole
         (squares,) = whole.left(range(columns.shape[1]))
         return float(np.log(squares + decisions.NOTHING))
 
@@ -451,10 +452,10 @@ def _with_slopes(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> tup
     """Return the number c of columns of terms, and a trial of them and of d(torque)/d(shape)."""
     families, flat = [family for family, _ in chosen], _flat(chosen)
     Z = drive.columns(_terms(drive, chosen))
-    theta = Trials(sample, Z[:, None], decisions.ROUNDING).whole.parameters(range(Z.shape[1]))
+    theta = Trials(sample, Z[:, None], REMAINDER).whole.parameters(range(Z.shape[1]))
     slopes = np.empty((len(Z), len(flat)))
     for k, h in enumerate(decisions.STEP * flat):
         larger = flat + h * (np.arange(len(flat)) == k)
         moved = drive.columns(_terms(drive, with_shapes(families, larger)))
         slopes[:, k] = (moved - Z) @ theta / h
-    return Z.shape[1], Trials(sample, np.hstack([Z, slopes])[:, None], decisions.ROUNDING).whole
+    return Z.shape[1], Trials(sample, np.hstack([Z, slopes])[:, None], REMAINDER).whole

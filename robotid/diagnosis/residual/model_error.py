@@ -15,9 +15,9 @@ from functools import partial
 
 import numpy as np
 
-from robotid.base.tolerances import TINY
+from robotid.base.tolerances import REMAINDER, TINY
 from robotid.base.typing import Array
-from robotid.diagnosis.decisions import GROWN, ROUNDING, STEP
+from robotid.diagnosis.decisions import GROWN, STEP
 from robotid.diagnosis.residual.misfit import Misfit
 from robotid.diagnosis.residual.term_trials import RIDGE, Sample, Trial, Trials, take_sample
 from robotid.dynamics.torque import drive_motion_along
@@ -76,7 +76,7 @@ def _of_shapes(fit: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> Iter
     # The errors of a joint's shapes are correlated: C_s = L L^T, one direction per column of L.
     for choice in fit.drives:
         if choice.shapes:
-            T = _trial(sample, choice, motions, partial(_slopes, fit, choice), ROUNDING).T[:, :-1]
+            T = _trial(sample, choice, motions, partial(_slopes, fit, choice), REMAINDER).T[:, :-1]
             variance, axes = np.linalg.eigh(np.array(choice.shape_covariance))
             for axis in (axes * np.sqrt(np.maximum(variance, 0.0))).T:
                 torque = partial(_shape_change, fit, choice, axis)
@@ -114,7 +114,7 @@ def settled_shapes(fit: Solution) -> tuple[DriveChoice, ...] | None:
     motions, drives, farthest = _motions(fit, sample), [], 0.0
     for choice in fit.drives:
         if choice.shapes:
-            whole = _trial(sample, choice, motions, partial(_slopes, fit, choice), ROUNDING)
+            whole = _trial(sample, choice, motions, partial(_slopes, fit, choice), REMAINDER)
             step, covariance = whole.estimate(list(range(len(choice.shapes))), sample.fitted)
             moved = choice.moved(step, covariance)
             before, after = (np.array([s.value for s in c.shapes]) for c in (choice, moved))

@@ -16,6 +16,7 @@ from functools import cached_property
 
 import numpy as np
 
+from robotid.base.tolerances import REMAINDER
 from robotid.base.typing import Array
 from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import sentence_of
@@ -133,7 +134,7 @@ class JointTorque:
     @cached_property
     def present(self) -> tuple[str, ...]:
         """Names of the parts that are more than rounding in any row."""
-        least = decisions.ROUNDING * float(np.abs(self.tau).max())
+        least = REMAINDER * float(np.abs(self.tau).max())
         return tuple(name for name, x in self.parts.items() if np.abs(x).max() > least)
 
     @property

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from robotid.base.findings import Finding, listed
-from robotid.base.tolerances import SLACK
+from robotid.base.tolerances import REMAINDER, SLACK
 from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import AGREES, ROUNDING
+from robotid.diagnosis.decisions import AGREES
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.robot.bodies import body_points, kinematic_lengths, link_places
 from robotid.robot.model import RobotModel
@@ -138,7 +138,7 @@ def weak_parameters(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding
 
 def _between(mapping: BaseMapping) -> int:
     """Return the number of pivots that are neither rounding errors nor large enough."""
-    return int(np.sum(mapping.pivots > ROUNDING)) - len(mapping.K)
+    return int(np.sum(mapping.pivots > REMAINDER)) - len(mapping.K)
 
 
 def _rounded(tree: Tree) -> dict[str, dict[str, float]]:

@@ -8,12 +8,7 @@ from helpers.estimation import ESTIMATORS, NOISE, Case, RandomStates
 
 from robotid.base.exceptions import DataError
 from robotid.dynamics.factors import compress
-from robotid.estimation.estimators import (
-    RLS,
-    Estimate,
-    Kalman,
-    fold,
-)
+from robotid.estimation.estimators import RLS, Estimate, Kalman, fold
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,11 +17,10 @@ from helpers.paths import DOCS, ROOT
 
 from robotid.base.exceptions import DataError
 from robotid.cli import main
-from robotid.cli.export import export as export_of
 from robotid.output.files.exports import formats
 from robotid.output.files.result_file import limit_of, load_result
 from robotid.robot.examples import example_urdf
-from robotid.robot.tree import Joint, read_with_yourdfpy
+from robotid.robot.tree import Joint
 
 RATE = 200.0  # [Hz] of the commands
 CHIRP = Path(os.environ.get("ROBOTID_DATA", "/none")) / "commands" / "go2" / "chirp.parquet"
@@ -240,48 +238,6 @@ def test_isaac_actuators_are_grouped_and_read_back(result, tmp_path, capsys):
             "min_delay": 3 if joint != LEG[2] else 2,  # 3.15 and 2.4 steps
             "max_delay": 3 if joint != LEG[2] else 2,
         }
-
-
-#: How the consumer of each format reads the stiffness or the Coulomb friction of a joint.
-CONSUMERS = {
-    "urdf": lambda path, joint: float(_named(read_with_yourdfpy(path), joint).dynamics.friction),
-    "mjcf": lambda path, joint: (
-        mujoco.MjModel.from_xml_path(str(path)).joint(joint).frictionloss[0]
-    ),
-    "sdf": lambda path, joint: float(
-        ET.parse(path).find(f".//joint[@name='{joint}']/axis/dynamics/friction").text
-    ),
-    "isaac": lambda path, joint: _group(path, joint)["friction"],
-    "ranges": lambda path, joint: yaml.safe_load(path.read_text())["drives"][joint]["coulomb"][
-        "nominal"
-    ],
-}
-
-
-def _named(robot, joint):
-    return next(each for each in robot.joints if each.name == joint)
-
-
-def _group(path, joint):
-    groups = yaml.safe_load(path.read_text())["actuators"].values()
-    return next(group for group in groups if joint in group["joint_names_expr"])
-
-
-@pytest.fixture(scope="module")
-def exportable(tmp_path_factory):
-    """The folder of a result with gains, which every format can state."""
-    leg = plant("leg", np.random.default_rng(0))
-    return written_result(leg, tmp_path_factory.mktemp("formats") / "out")
-
-
-@pytest.mark.parametrize("kind", formats())
-def test_each_format_is_read_back_by_its_consumer(kind, exportable, tmp_path):
-    target = tmp_path / f"robot{formats()[kind].suffix}"
-    done = export_of(exportable, kind, target)
-    assert done["files"][0] == str(target)
-    loaded = load_result(exportable)
-    for drive in loaded.commanded:
-        assert CONSUMERS[kind](target, drive.joint) == pytest.approx(drive.coulomb, rel=1e-4)
 
 
 def test_the_pages_name_each_format():

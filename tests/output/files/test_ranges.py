@@ -322,8 +322,10 @@ def test_drives_of_commands_have_no_sample_below_zero(tmp_path):
 def test_a_gain_that_varies_between_logs_has_no_range_below_zero(tmp_path):
     result = load_result(written_result(plant("planar", np.random.default_rng(0)), tmp_path / "r"))
     gain = next(e for e in result.content["drive_parameters"] if e["name"].endswith(".kp"))
-    changed = {"drive_parameters": [{**gain, "std_error": 1.0}],
-               "variation": {"parameters": {gain["name"]: {"next_interval": [-1.0, 40.0]}}}}
+    changed = {
+        "drive_parameters": [{**gain, "std_error": 1.0}],
+        "variation": {"parameters": {gain["name"]: {"next_interval": [-1.0, 40.0]}}},
+    }
     drive = gain["name"].removesuffix(".kp")
     found = stated_ranges({**result.content, **changed})["drives"][drive]["kp"]
     assert (found["low"], found["high"], found["source"]) == (0.0, 40.0, "logs")

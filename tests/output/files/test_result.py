@@ -14,7 +14,7 @@ import pytest
 import robotid
 from robotid.base.exceptions import DataError, ModelError
 from robotid.base.findings import Finding
-from robotid.output.files.entries import _covariance, build_result, loop_entries, loop_parameters
+from robotid.output.files.entries import _covariance, build_result, loop_entries
 from robotid.output.files.result_file import read_result, stated_parameters
 
 FINDINGS = [Finding("late", "warning", "a.csv", "late by 4 ms"), Finding("b", "note", "c", "d")]
@@ -141,20 +141,6 @@ def test_a_result_without_a_urdf_says_why_there_is_no_robot(loaded_from, tmp_pat
     assert result.verdict["status"]
     with pytest.raises(DataError, match=r"result.json has no URDF, because its parameters are"):
         _ = result.robot
-
-
-def test_each_joint_has_its_gains_with_units_and_sources(crane):
-    shown = {entry["name"]: entry for entry in loop_parameters(crane)}
-    units = {"rail": ("N/m", "N s/m", "m"), "turn": ("N m/rad", "N m s/rad", "rad")}
-    loops, unknowns = crane.fit.loops, crane.fit.simulator.free_parameters
-    free = {(x.what, crane.model.joints[j]): k for k, x in enumerate(unknowns) for j in x.joints}
-    for j, (joint, (of_kp, of_kd, of_zero)) in enumerate(units.items()):
-        for what, unit in (("kp", of_kp), ("kd", of_kd), ("delay", "s"), ("zero", of_zero)):
-            entry, k = shown[f"{joint}.{what}"], free.get((what, joint))
-            assert (entry["value"], entry["unit"]) == (getattr(loops, what)[j], unit)
-            assert (entry["source"] == "stated") == (k is None)
-            error = None if k is None else crane.fit.estimate.std_error[k]
-            assert entry["std_error"] == error
 
 
 def test_bodies_that_no_log_determines_are_named_as_undetermined(crane):

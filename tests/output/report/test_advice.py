@@ -152,10 +152,7 @@ def test_a_named_cause_has_its_step_and_no_guess_beside_it(identified, code, rng
     blocks = [block for step in steps for block in step.blocks]
     if code in ("friction_shape", "spring"):
         (drives,) = [block for block in blocks if block.startswith("[drives]")]
-        wanted = {
-            "friction_shape": ("stribeck",),
-            "spring": ("harmonics2", "spring"),
-        }
+        wanted = {"friction_shape": ("stribeck",), "spring": ("harmonics2", "spring")}
         assert read(drives).drives == {joint: wanted[code]}
     if code == "backlash":  # there is no term for it, and the same logs are not repeated
         assert [step.blocks for step in steps if step.words.startswith(NAMED[code])] == [()]

@@ -6,7 +6,7 @@ from dataclasses import replace
 from html import unescape
 
 import pytest
-from helpers.pages import charts, tables
+from helpers.pages import charts
 
 from robotid.base.findings import Finding
 from robotid.output.report.next_steps import Origin
@@ -40,19 +40,6 @@ def test_the_worst_second_is_in_mrad_and_the_replay_knows_when_each_log_ends(fou
     clips = json.loads(unescape(re.search(r'data-clips="(.*?)"', page)[1]))
     ends = [(e.log.t[0], e.log.t[-1]) for e in (*found.validation, *found.fitted)]
     assert [(clip["start"], clip["end"]) for clip in clips] == ends
-
-
-def test_parameters_findings_and_commands_are_shown(found, page):
-    rows = tables(page)["Parameters of links and drives"].rows
-    sources = {f"{row[0]}.{row[1]}": row[8] for row in rows}
-    assert sources["rail.kp"] == "stated"
-    assert sources["rail.delay"] == "data"
-    assert "turn &lt;i&gt;saturates" in page
-    assert "Positions and commands determine torques up to a common factor" in page
-    plain = page.replace("<span>", "").replace("</span>", "")
-    commands = re.findall(r'<pre class="command">(.*?)</pre>', plain)
-    assert [words.split()[1] for words in commands[-4:]] == ["replay", "export", "export", "export"]
-    assert tables(page)["Files read"].column("role") == ["URDF", "fitted", "fitted", "validation"]
 
 
 def test_without_validation_the_fitted_logs_are_shown_and_a_torque_is_no_command(found, tmp_path):
