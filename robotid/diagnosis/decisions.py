@@ -14,7 +14,6 @@ import numpy as np
 from scipy.special import stdtr
 
 from robotid.base.tolerances import REMAINDER
-from robotid.base.tolerances import TINY as TINY
 from robotid.base.typing import Array
 
 

@@ -11,9 +11,7 @@ from robotid.data import units
 from robotid.data.base_motion import GAP_STEPS
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
-from robotid.data.units import AT_REST as AT_REST
-from robotid.data.units import STATIC as STATIC
-from robotid.data.units import STILL
+from robotid.data.units import AT_REST, STATIC, STILL
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import AGREES, BEYOND_NOISE, DIFFERS, SHARE_OF_ROWS
 from robotid.robot.parameters import ParameterLayout

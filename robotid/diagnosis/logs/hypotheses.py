@@ -10,12 +10,13 @@ from itertools import combinations
 
 import numpy as np
 
+from robotid.base.tolerances import TINY
 from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process, resolve, unwrap
-from robotid.diagnosis.decisions import TINY
-from robotid.diagnosis.logs.channels import AT_REST, ZERO
+from robotid.data.units import AT_REST
+from robotid.diagnosis.logs.channels import ZERO
 from robotid.dynamics.rows import drive_values, friction_directions, friction_speeds, inertial_rows
 from robotid.robot.model import GRAVITY, RobotModel
 

@@ -7,11 +7,12 @@ import numpy as np
 import scipy.special
 
 from robotid.base.findings import Finding, listed
+from robotid.base.tolerances import TINY
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
+from robotid.data.units import STATIC
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import BEYOND_NOISE, NO_ERROR_OF_MASSES, ROWS, SIGNIFICANT, TINY
-from robotid.diagnosis.logs.channels import STATIC
+from robotid.diagnosis.decisions import BEYOND_NOISE, NO_ERROR_OF_MASSES, ROWS, SIGNIFICANT
 from robotid.diagnosis.logs.hypotheses import (
     CERTAIN,
     FLOOR,
