@@ -19,7 +19,7 @@ import numpy as np
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
-from robotid.base.tolerances import REMAINDER
+from robotid.base.tolerances import REMAINDER, TINY
 from robotid.base.typing import Array
 from robotid.diagnosis import decisions
 from robotid.diagnosis.decisions import Round, select
@@ -412,7 +412,7 @@ def _reweighted(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> Samp
     whole = Trials(sample, drive.columns(terms)[:, None]).whole
     before, after = (float(whole.left(which).sum()) for which in ([], list(range(len(terms)))))
     return sample.reweighted(
-        np.sqrt(before / max(after, decisions.TINY * before, decisions.NOTHING))
+        np.sqrt(before / max(after, TINY * before, decisions.NOTHING))
     )
 
 
