@@ -411,9 +411,7 @@ def _reweighted(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> Samp
     terms = _terms(drive, chosen)
     whole = Trials(sample, drive.columns(terms)[:, None]).whole
     before, after = (float(whole.left(which).sum()) for which in ([], list(range(len(terms)))))
-    return sample.reweighted(
-        np.sqrt(before / max(after, TINY * before, decisions.NOTHING))
-    )
+    return sample.reweighted(np.sqrt(before / max(after, TINY * before, decisions.NOTHING)))
 
 
 def _terms(drive: _Drive, chosen: Sequence[_Sized]) -> tuple[DriveTerm, ...]:
