@@ -13,7 +13,6 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from scipy.special import stdtr
 
-from robotid.base.tolerances import REMAINDER
 from robotid.base.typing import Array
 
 
@@ -85,6 +84,7 @@ NO_ERROR_OF_MASSES = 3.0
 BETTER = 0.5
 SCATTERED = 3  # Segments from which a scatter is determined
 NOTHING = 1e-300  # A sum of squares that is 0, as a divisor
+_STILL = 1e-9  # of the largest squared residual of a segment: below, the joint is at rest in it
 Option = TypeVar("Option", bound=Hashable)
 
 
@@ -157,7 +157,7 @@ def p_value(before: Array, after: Array, fitted: int) -> float:
 
 def _student(before: Array, after: Array) -> float:
     """Return the p-value of the mean share; 1 for too few segments."""
-    moves = before > REMAINDER * before.max(initial=0.0)  # else the joint is at rest in the segment
+    moves = before > _STILL * before.max(initial=0.0)
     if moves.sum() < SCATTERED:
         return 1.0
     gain = (before - after)[moves] / np.maximum(before, after)[moves]

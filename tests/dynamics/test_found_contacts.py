@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.legged import SOLO_FEET as FEET
+from helpers.legged import solo_on_points
 from helpers.paths import JOBS
 
 from robotid.base.exceptions import DataError
@@ -15,20 +17,13 @@ from robotid.dynamics.constraint_rows import constraint_jacobian
 from robotid.dynamics.prepared_logs import find_contacts, with_contacts
 from robotid.dynamics.torque import predict_instants
 from robotid.robot.constraints import Contact
-from robotid.robot.examples import example_urdf
-from robotid.robot.model import RobotModel
 
-FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
 RAW = SignalSettings(cutoff=None, trim=0.0, velocity="differentiated")
 
 
 @pytest.fixture(scope="module")
 def robot():
-    """Return Solo12 on its four feet, as points."""
-    return RobotModel.from_urdf(
-        example_urdf("solo12.urdf"), free_flyer=True, terms=(),
-        constraints=[Contact(foot) for foot in FEET],
-    )  # fmt: skip
+    return solo_on_points()
 
 
 def standing(robot, loaded):

@@ -9,11 +9,22 @@ import pinocchio as pin
 from robotid.data.base_motion import BaseMotion, ImuFrame, motion_of_imu
 from robotid.data.log import Log
 from robotid.robot.constraints import Contact, frame_id
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 
 _HOLD = 10  # steps during which a torque is held
 _RADIUS = 1e-3  # [m] of the feet: contacts are at the origin of the foot's link, or at its corners
 SETTLES = 1.0  # [s] from the first posture to the start of the log
+SOLO_FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
+
+
+def solo_on_points():
+    """Return Solo12 on its four feet, as points."""
+    return RobotModel.from_urdf(
+        example_urdf("solo12.urdf"), free_flyer=True, terms=(),
+        constraints=[Contact(foot) for foot in SOLO_FEET],
+    )  # fmt: skip
 
 
 def spec_of(

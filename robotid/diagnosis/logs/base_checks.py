@@ -36,9 +36,8 @@ _ALIKE = (0.6, 1.6)  # factors of the forces that a wrong URDF explains
 _FORCE_UNITS = {"kN": 1e3, "kgf": 9.81}
 _SLOWER = 0.65  # ratio of speeds below which another pose explains the motion
 _SIMPLER = 1.2  # factor by which each further change of a pose must reduce the speed ...
-_NOISE = (
-    1e-3  # [m/s or rad/s] ... plus this noise, the RMS value from which velocities are compared
-)
+# [m/s or rad/s] ... plus this noise, the RMS value from which velocities are compared
+_NOISE = 1e-3
 _UNLIKE = 0.3  # of the motion or weight: difference of a wrong velocity or force
 _DEGREES = np.pi / 180
 _UNITS = {"linear": ("mm/s", 1e-3), "angular": ("deg/s", _DEGREES)}

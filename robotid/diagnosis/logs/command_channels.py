@@ -24,12 +24,13 @@ _HALF_POWER = np.sqrt(0.5)  # response at the bandwidth of a loop, over the resp
 _RIPPLE = 5  # number of frequencies over which the size of a response is smoothed
 _DELAYS = np.arange(0.0, 0.2, 0.001)  # [s] grid of the delays
 _LONGEST = 0.5  # [s] longest delay, or lead, of the position
+_AS_ALIKE = 0.9  # share of the largest correlation that counts as equal to it
 _DETERMINED = 0.02  # [s] width of the range of delays below which a delay is determined
 _UPDATED = 1.5  # [rows] between updates of a command that is zero-order held
 _MANY = 20  # values of a smooth command, and rows of a constant one that is intended
 _INTERVAL = 0.1  # [s] over which changes of commands are compared
 _FOLLOWED = 0.5  # share of slow sweeps that a joint should follow if its lag is known ...
-_STUCK = 0.2  # ... and if it is not, which tells what sweeps are slow
+_STUCK = 0.2  # ... and if its lag is unknown, so that it is open which sweeps are slow
 _SLOW = 5.0  # [lags] least duration of slow sweeps ...
 _SWEEPS = 4  # ... and least number to judge a joint by
 _RESOLVED = 10.0  # least number of encoder steps in a sweep, and of rows per period
@@ -37,9 +38,8 @@ _SETTLED = 0.5  # [s] after its last change a command is constant ...
 _CONSTANT = 2.0  # [s] ... and least total time of this
 _DISTURBED = 0.01  # [rad or m] least motion under a constant command ...
 _EXPLAINED = 0.7  # ... and share of it that the other joints must explain
-_FLAT = (
-    0.6  # of the rows above half of a speed: share near it of movements at one speed, a sine: 0.43
-)
+# Share of the rows above half of a speed that are near it, in movements at one speed; a sine: 0.43
+_FLAT = 0.6
 _UNLIKE = 0.2  # least relative difference of this speed from that of the command ...
 _PULSES = 3  # ... and least number of such movements
 
@@ -175,7 +175,7 @@ class _Loop:
         alike, rows = alike[within], rows[within]
         if not alike.max() > 0:
             return np.nan
-        best = rows[alike >= 0.9 * alike.max()]
+        best = rows[alike >= _AS_ALIKE * alike.max()]
         return float(best[np.argmin(np.abs(best))]) * self.step
 
     @cached_property

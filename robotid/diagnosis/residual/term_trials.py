@@ -97,9 +97,8 @@ class Sample:
     recordings: tuple[Recording, ...]  # the fitted ones, then those of validation, if used
     at: tuple[Trajectory, ...]  # their motions at these samples
     taken: tuple[Array, ...]  # indices of these samples in each recording
-    weight: (
-        Array  # (N, n_rows), of torques [1/(N m), 1/N]; alike if constraint forces are eliminated
-    )
+    # (N, n_rows), of torques [1/(N m), 1/N]; alike if constraint forces are eliminated
+    weight: Array
     torque: Array  # (n_rows,), weighted sum of the squared torques of fitted samples
     segments: tuple[slice, ...]  # samples of each of the K segments, of validation logs last
     rows: int  # number of samples of fitted logs
@@ -275,11 +274,8 @@ def _segments(fitted: int, validation: int, independent: float) -> tuple[slice, 
     """Return the segments of the samples of fitted and of validation recordings."""
     edges = [0]
     for rows in (fitted, validation):
-        count = (
-            min(decisions.SEGMENTS, max(1, int(rows * independent / decisions.SHORTEST)))
-            if rows
-            else 0
-        )
+        enough = max(1, int(rows * independent / decisions.SHORTEST))
+        count = min(decisions.SEGMENTS, enough) if rows else 0
         first = edges[-1]
         edges += [first + rows * (i + 1) // count for i in range(count)]
     return tuple(slice(*pair) for pair in pairwise(edges))

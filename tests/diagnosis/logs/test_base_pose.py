@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.legged import with_other_bodies
+from helpers.legged import SOLO_FEET as FEET
+from helpers.legged import solo_on_points, with_other_bodies
 from helpers.stands import recorded, stand
 
 from robotid.data.base_motion import (
@@ -33,16 +34,11 @@ from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
 SLOW, RAW = SignalSettings(cutoff=4.0), SignalSettings(cutoff=None, trim=0.0)
-FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
 
 
 @pytest.fixture(scope="module")
 def robot():
-    """Return Solo12 on its four feet, as points."""
-    return RobotModel.from_urdf(
-        example_urdf("solo12.urdf"), free_flyer=True, terms=(),
-        constraints=[Contact(foot) for foot in FEET],
-    )  # fmt: skip
+    return solo_on_points()
 
 
 @pytest.fixture(scope="module")

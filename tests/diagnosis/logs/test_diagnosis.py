@@ -304,7 +304,7 @@ def test_a_load_is_not_taken_for_another_gravity():
 
 
 # --- traps that the publishers of recordings warn of ----------------------------------------------
-# what the notes of each set say, and the finding with the figure that tells it
+# what the notes of each set say, and the finding with its figure
 TRAPS = {
     "kinova_gen3/gen3_1.parquet": [
         ("gap", "longest", 0.9, 1.0),  # slow samples were removed
