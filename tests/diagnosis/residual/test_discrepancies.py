@@ -134,6 +134,10 @@ def test_columns_are_derivatives_of_the_torque(model):
     found = {
         (a.reading.code, a.joints): Z[..., 0] for a, Z in alterations(model, pi, sample).items()
     }
+    # gains: of one joint, or of all from one on but the first and the last
+    ends = [model.joints[first:] for first in (1, 2, 3, 4)]
+    scaled = {joints for code, joints in found if code == "torque_scale"}
+    assert scaled == {*((joint,) for joint in model.joints), *ends}
 
     def torques(change, x):
         return np.concatenate([inverse_dynamics(model, pi, change(m, x)) for m in sample.at])
