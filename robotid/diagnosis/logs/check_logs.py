@@ -13,6 +13,7 @@ import numpy as np
 
 from robotid.base.exceptions import DataError, RobotIdError
 from robotid.base.findings import Finding, by_severity, toml_key
+from robotid.base.tolerances import TINY
 from robotid.base.typing import Array
 from robotid.data.log import REPEATED, Log, Trajectory, repeated_share
 from robotid.data.signal_settings import LogUnits, SignalSettings
@@ -21,8 +22,13 @@ from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.logs import channels
 from robotid.diagnosis.logs.base_checks import check_base
 from robotid.diagnosis.logs.command_channels import check_commands
-from robotid.diagnosis.logs.hypotheses import Probe, smooth_motion, take_probe
-from robotid.diagnosis.logs.torque_checks import check_payload_change, check_torques, reductions_of
+from robotid.diagnosis.logs.probe import Probe, smooth_motion, take_probe
+from robotid.diagnosis.logs.torque_checks import (
+    TorqueCheck,
+    check_payload_change,
+    is_suspect,
+    reductions_of,
+)
 from robotid.diagnosis.logs.torque_delay import check_torque_delay
 from robotid.diagnosis.urdf.inertials import assumed_inertials, explained_by_assumed, rounded_angles
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
@@ -47,6 +53,10 @@ def diagnose(
     first = [motion for motion, _ in motions[: len(fitted)] if motion is not None]
     probes = [probe for _, probe in motions[: len(fitted)] if probe is not None]
     mapping = structural_mapping(model) if probes else None
+    without_sign = {x.log for x in findings if x.code == "unsigned_torque"}  # these fit no model
+    checked = zip((*fitted, *validation), motions, strict=True)
+    checks = [(log, probe) for log, (_, probe) in checked if probe and log.name not in without_sign]
+    findings += _examine_torques(model, checks, signals)
     moving = [probe.motion for probe in probes]
     segments: list[Reduction] = []  # of the fitted motions, made if they are compared
     for log, (motion, probe) in zip(validation, motions[len(fitted) :], strict=True):
@@ -88,8 +98,8 @@ def _examine_log(
     findings += check_commands(log, prismatic)
     driven = [joint for joint in log.joints if joint not in model.passive]
     has_torque = log.has_torque and bool(driven)
-    sizes = list(channels.check_torque_channels(log.select(driven))) if has_torque else []
-    findings += sizes
+    if has_torque:
+        findings += channels.check_torque_channels(log.select(driven))
     if model.free_flyer or model.constraints or model.passive:
         findings.append(finding("floating_base", name))
         findings += check_base(model, log, signals)
@@ -108,13 +118,25 @@ def _examine_log(
     if probe is None:
         findings.append(finding("no_motion", name))
         return motion, None
-    if any(x.severity == "error" for x in sizes):
-        return motion, probe  # torques without signs fit no model
-    torques = list(check_torques(probe, name))
-    findings += torques
-    if not any(x.severity == "error" for x in torques):
-        findings += check_torque_delay(model, log, signals, name)
     return motion, probe
+
+
+def _examine_torques(
+    model: RobotModel, probes: Sequence[tuple[Log, Probe]], signals: SignalSettings
+) -> Iterator[Finding]:
+    """Yield the findings on the torques of logs."""
+    # Other readings are tried for the log that is explained worst, and for those that are explained
+    # clearly worse than another; for all once one is found.
+    checks = [(log, TorqueCheck.of(probe)) for log, probe in probes]
+    checks.sort(key=lambda x: float(np.log(x[1].share + TINY).mean()), reverse=True)
+    is_read = False
+    for i, (log, check) in enumerate(checks):
+        is_tried = i == 0 or is_read or is_suspect(check, [one for _, one in checks])
+        read = list(check.read(log.name)) if is_tried else []
+        is_read |= bool(read)
+        yield from read or check.loads(log.name)
+        if not any(x.severity == "error" for x in read):
+            yield from check_torque_delay(model, log, signals, log.name)
 
 
 def check_excitation(
