@@ -28,11 +28,11 @@ from robotid.robot.prior import prior_spread
 
 CERTAIN = 2.0  # decrease of the misfit from which another reading is certain
 EXPLAINED = 0.1  # unexplained share of a torque below which a reading explains it
-_POOR = 0.0025  # unexplained share of a torque from which other readings are tried ...
+_POOR = 0.0005  # unexplained share of a torque from which other readings are tried ...
 _GROSS = 0.05  # ... and from which other directions of the axes are tried
 _FLOOR = 1e-5  # an unexplained share below this is rounding
 _LOOSE = 10.0  # prior deviation of the bodies, in sizes of the URDF's
-_FEW = 24  # instants with which the readings are chosen that are tried with all
+_FEW = 48  # instants with which the readings are chosen that are tried with all
 _SEGMENTS = 8  # of the log that are held out in turn
 _BODIES = 20  # of a limb, at most
 _TRIED = 5  # readings that are tried with all instants
@@ -181,6 +181,8 @@ class Samples:
         """Return the gain of the torques of some joints that the other joints predict."""
         products, size = self._problem
         whole, at = products.sum(axis=0), np.isin(self.motion.rows, joints)
+        if not size[at].all():
+            return 0.0
         x = _fitted(whole, np.where(at, 0.0, size), len(self.motion.q))
         # torque of the bodies so predicted, and drives: tau = gain (X x + X pi) + drives
         c = x.shape[1]

@@ -1,7 +1,7 @@
 """Checks of the torques against the model: other readings of the log, masses and loads."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.special
@@ -45,18 +45,19 @@ class TorqueCheck:
 
     probe: Probe
     limbs: tuple[tuple[Samples, bool], ...]  # and whether other readings of them are tried
-    share: Array  # (n,), unexplained share of each torque
+    share: Array  # (n,), unexplained share of each torque, 1 of joints at rest
 
     @classmethod
     def of(cls, probe: Probe) -> "TorqueCheck":
         """Return the check of a log."""
-        groups = tuple((Samples.of(probe, rows), is_tried) for rows, is_tried in limbs(probe.model))
-        share = np.zeros(probe.tau.shape[1])
-        for samples, _ in groups:
-            share[samples.motion.rows] = samples.share
         # the friction of a joint at rest has any value: nothing contradicts its torque
-        still = np.ptp(probe.motion.q, axis=0) < STATIC
-        return cls(probe, groups, np.where(still, 0.0, np.minimum(share, 1.0)))
+        moves = np.ptp(probe.motion.q, axis=0) >= STATIC
+        groups = [(rows[moves[rows]], is_tried) for rows, is_tried in limbs(probe.model)]
+        samples = tuple((Samples.of(probe, rows), x) for rows, x in groups if len(rows))
+        share = np.ones(len(moves))
+        for one, _ in samples:
+            share[one.motion.rows] = np.minimum(one.share, 1.0)
+        return cls(probe, samples, share)
 
     def read(self, name: str) -> Iterator[Finding]:
         """Yield the other readings that explain the torques."""
@@ -67,15 +68,19 @@ class TorqueCheck:
     def loads(self, name: str) -> Iterator[Finding]:
         """Yield another scale, a load or another robot, and torques that nothing explains."""
         yield from _check_loads(self.probe, self.share, name)
-        code, bad = "unexplained_torque", np.flatnonzero(self.share > _UNEXPLAINED)
+        rows = np.concatenate([samples.motion.rows for samples, _ in self.limbs])
+        bad = [j for j in rows if self.share[j] > _UNEXPLAINED]
         if 2 * len(bad) > len(self.share):
-            middle = float(np.median(self.share))
             yield finding(
-                code, name, what="robot", joints=len(bad), of=len(self.share), share=middle
-            )
+                "unexplained_torque", name, what="robot", joints=len(bad), of=len(self.share),
+                share=float(np.median(self.share)),
+            )  # fmt: skip
             return
         for j in bad:
-            yield finding(code, name, self.probe.model.joints[j], what="joint", share=self.share[j])
+            yield finding(
+                "unexplained_torque", name, self.probe.model.joints[j], what="joint",
+                share=self.share[j],
+            )  # fmt: skip
 
 
 def is_suspect(check: TorqueCheck, others: Sequence[TorqueCheck]) -> bool:
@@ -244,8 +249,11 @@ def _check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
             is_unit = abs(np.log(factor)) > np.log(_OTHER_UNIT)
             yield finding(
                 "current_for_torque", name, severity="error" if is_unit else "warning",
-                factor=factor, joints=len(ones), joint=listed(probe.model.joints),
+                factor=factor, joints=len(ones), joint=listed(probe.model.joints), also=False,
             )  # fmt: skip
+            return
+        if _is_compensated(probe):
+            yield finding("gravity_compensated", name, what="robot")
             return
         if is_other or _error_of_links(theta) > _MISMATCH:
             factors = dict(zip(probe.model.layout.bodies, theta[:bodies].tolist(), strict=True))
@@ -253,6 +261,16 @@ def _check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
             yield finding("urdf_mismatch", name, factors=words, **factors)
             return
     yield from _payload(probe, theta[bodies:], float(error[bodies]), name)
+
+
+def _is_compensated(probe: Probe) -> bool:
+    """Return whether torques fit the URDF's masses only with the URDF's gravity added."""
+    still = np.zeros_like(probe.v)
+    weight = replace(probe, v=still, a=still).loads.sum(axis=2)
+    if not weight.any():
+        return False
+    whole = TorqueCheck.of(replace(probe, tau=probe.tau + weight))
+    return load_model(whole.probe, whole.share).is_this_robot(np.ones(len(whole.share)))
 
 
 def _error_of_links(theta: Array) -> float:
