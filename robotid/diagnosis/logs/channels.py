@@ -198,9 +198,10 @@ def _velocity_scale(log: Log, moved: Array, integral: Array, velocity: str) -> I
     every = np.array([*factors.values()])
     is_known = len(factors) > 1 or len(log.joints) == 1
     factor, error = _common(*every.T) if is_known else (1.0, 0.0)
+    least = DIFFERS if units.coarse_velocities(log) else _CLOCK  # steps may be truncated
     if abs(factor / _RPM - 1.0) < _CLOCK:
         factor = 1.0  # a unit of the velocities
-    elif abs(factor - 1.0) > max(_CLOCK, BEYOND_NOISE * error):
+    elif abs(factor - 1.0) > max(least, BEYOND_NOISE * error):
         yield finding(
             "time_scale:velocities", log.name, factor=factor, std_error=error,
             severity="error" if abs(factor - 1.0) > DIFFERS else "warning",
