@@ -41,7 +41,8 @@ from robotid.robot.prior import prior_spread, with_assumed_inertials
 
 _ROWS = 5000  # of a log, from which its excitation is computed
 #: Findings on one torque, which another quantity in its column explains.
-_OF_A_DRIVE = ("current_for_torque", "torque_sign", "unexplained_torque", "unsigned_torque")
+_OF_A_DRIVE = ("current_for_torque", "gravity_compensated", "torque_sign", "unexplained_torque",
+               "unsigned_torque")  # fmt: skip
 _BEYOND = ("beyond_limits", "beyond_effort")
 #: Errors of channels after which no model fits the torques.
 _FIT_NO_MODEL = ("time_scale", "unsigned_torque", "constant_torque")
@@ -137,9 +138,7 @@ def _examine_log(model: RobotModel, log: Log, signals: SignalSettings) -> _Exami
     return one
 
 
-def _examine_torques(
-    model: RobotModel, logs: Sequence[_Examined], signals: SignalSettings
-) -> None:
+def _examine_torques(model: RobotModel, logs: Sequence[_Examined], signals: SignalSettings) -> None:
     """Add the findings on the torques of logs."""
     # Other readings are tried for the log that is explained worst, and for those that are explained
     # clearly worse than another; for all once one is found.
@@ -158,9 +157,7 @@ def _examine_torques(
         coarse = {joint for x in one.findings if x.code == "quantised" for joint in x.joints}
         off = [x for x in _drives_off(check.probe, coarse, name) if moved.isdisjoint(x.joints)]
         beyond = [x for x in one.findings if x.code in _BEYOND]
-        one.findings[:] = [
-            x for x in one.findings if x not in beyond or moved.isdisjoint(x.joints)
-        ]
+        one.findings[:] = [x for x in one.findings if x not in beyond or moved.isdisjoint(x.joints)]
         errors = [x for x in (*beyond, *off) if x.severity == "error"]
         named = {joint for x in errors for joint in x.joints} - moved
         torques = [

@@ -20,6 +20,7 @@ import numpy as np
 import pinocchio as pin
 
 from robotid.base.typing import Array
+from robotid.diagnosis.decisions import NO_ERROR_OF_MASSES
 from robotid.diagnosis.logs.channels import ZERO
 from robotid.diagnosis.logs.probe import Probe, drive_columns
 from robotid.dynamics.rows import inertial_rows, joint_constants
@@ -63,18 +64,13 @@ class _Motion:
     v: Array  # (N, n)
     a: Array  # (N, n)
     tau: Array  # (N, n) [N m or N], columns as logged
+    size: Array  # (n,), squared variation of each of them, 0 if constant
     rows: Array  # (m,), the limb's joints
     spread: Array  # (p,), prior deviations of the bodies
     gravity: Array  # (n,), factor of the torque of gravity on each joint
     inertia: Array  # (n,), factor of the torque of inertia on each joint
     subtracted: float = 0.0  # factor of the URDF's gravity that was subtracted from the torques
     segments: int = _SEGMENTS  # of the instants
-
-    @cached_property
-    def size(self) -> Array:
-        """Squared variation of each torque column, (n,), 0 if constant."""
-        squares = np.sum((self.tau - self.tau.mean(axis=0)) ** 2, axis=0)
-        return np.where(squares > _FLOOR**2 * np.sum(self.tau**2, axis=0), squares, 0.0)
 
     @cached_property
     def products(self) -> Array:
@@ -130,15 +126,18 @@ class Samples:
         """Return the samples of a log as it is."""
         one, model = np.ones(probe.tau.shape[1]), probe.model
         spread = prior_spread(model, np.ones((3, model.n_rows)), 1)[: model.layout.n_inertial]
-        at = probe.q, probe.v, probe.a, probe.tau
+        at = probe.q, probe.v, probe.a, probe.tau, _variation(probe.tau)
         motion = _Motion(model, *at, rows, _LOOSE * spread, one, one)
-        return cls(motion, np.arange(len(one)), one, one)
+        samples = cls(motion, np.arange(len(one)), one, one)
+        gain = samples.gain_without(tuple(rows))  # of all of them: they may have another unit
+        is_other = gain > 0.0 and abs(np.log(gain)) > np.log(NO_ERROR_OF_MASSES)
+        return replace(samples, gain=gain * one) if is_other else samples
 
     def few(self) -> "Samples":
         """Return some of the instants, in one segment."""
         step = max(1, len(self.motion.q) // _FEW)
         some = {key: getattr(self.motion, key)[::step] for key in ("q", "v", "a", "tau")}
-        return self.changed(segments=1, **some)
+        return self.changed(segments=1, size=_variation(some["tau"]), **some)
 
     def changed(self, **values: Any) -> "Samples":  # noqa: ANN401
         """Return the samples with other values of the motion or of the robot."""
@@ -180,28 +179,21 @@ class Samples:
     def gain_without(self, joints: tuple[int, ...]) -> float:
         """Return the gain of the torques of some joints that the other joints predict."""
         products, size = self._problem
-        whole, at = products.sum(axis=0), np.isin(self.motion.rows, joints)
-        if not size[at].all():
-            return 0.0
-        x = _fitted(whole, np.where(at, 0.0, size), len(self.motion.q))
-        # torque of the bodies so predicted, and drives: tau = gain (X x + X pi) + drives
-        c = x.shape[1]
-        G = self.motion.products.sum(axis=0)
-        y = np.zeros((len(x), G.shape[-1]))
-        y[:, : c - _DRIVE] = x[:, : c - _DRIVE]
-        y[:, c] = 1.0
+        rows, at = self.motion.rows, np.isin(self.motion.rows, joints) & (size > 0.0)
+        x = _fitted(products.sum(axis=0), np.where(at, 0.0, size), len(self.motion.q))
+        # tau = gain (X x + X pi) + drives, by the products of these columns
+        G, c = self.motion.products.sum(axis=0), x.shape[1]
         squares = np.zeros((1 + _DRIVE * int(at.sum()),) * 2)
         b = np.zeros(len(squares))
         for k, j in enumerate(np.flatnonzero(at)):
             own = 1 + _DRIVE * k + np.arange(_DRIVE)
-            tau, drive = c + 1 + self.order[self.motion.rows[j]], np.arange(c - _DRIVE, c)
-            w, s = 1.0 / size[j], self.sign[self.motion.rows[j]]
-            Gy = G[j] @ y[j]
-            squares[0, 0] += w * y[j] @ Gy
-            squares[0, own] = squares[own, 0] = w * Gy[drive]
-            squares[np.ix_(own, own)] = w * G[j][np.ix_(drive, drive)]
-            b[0] += w * s * Gy[tau]
-            b[own] = w * s * G[j][drive, tau]
+            P = np.zeros((G.shape[-1], 1 + _DRIVE))
+            P[: c - _DRIVE, 0], P[c, 0] = x[j, : c - _DRIVE], 1.0
+            P[c - _DRIVE : c, 1:] = np.eye(_DRIVE)
+            column = c + 1 + self.order[rows[j]]
+            places = np.append(0, own)
+            squares[np.ix_(places, places)] += P.T @ G[j] @ P / size[j]
+            b[places] += self.sign[rows[j]] * P.T @ G[j][:, column] / size[j]
         return float(np.linalg.lstsq(squares, b)[0][0])
 
     @cached_property
@@ -212,6 +204,12 @@ class Samples:
         for segment in products:
             left += _left(segment, _fitted(whole - segment, size, len(self.motion.q)))
         return _over(left, size)
+
+
+def _variation(tau: Array) -> Array:
+    """Return the sum of squares of torques (N, n) about their mean, (n,), 0 if constant."""
+    squares = np.sum((tau - tau.mean(axis=0)) ** 2, axis=0)
+    return np.where(squares > _FLOOR**2 * np.sum(tau**2, axis=0), squares, 0.0)
 
 
 def misfit(share: Array) -> float:
@@ -327,7 +325,8 @@ def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
             yield Reading("position_sign", (j,), partial(_mirrored, j=j))
     for j in samples.unsigned:
         yield Reading("unsigned_torque", (j,), partial(_signed, j=j))
-    for group in [*zip(rows, strict=True), *(tuple(rows[first:]) for first in range(1, len(rows) - 1))]:
+    wrists = (tuple(rows[first:]) for first in range(1, len(rows) - 1))
+    for group in [*zip(rows, strict=True), *wrists]:
         gain = samples.gain_without(group)
         if gain > 0.0:
             scaled = partial(_scaled, on=one[list(group)].sum(axis=0))
@@ -462,12 +461,8 @@ def best_readings(samples: Samples) -> Iterator[Best]:
         alike = [r for r in sorted(left, key=lambda r: left[r][1:]) if left[r][0] < least + 1.0]
         best = alike[0].refined(few, 20)
         read = best.of(samples)
-        if DEBUG:
-            print("     ", [(r.code, r.joints, np.round(r.values, 3).tolist(), round(misfit(samples.share)-g[0], 2)) for r, g in left.items()], np.round(samples.held_out,3), np.round(read.held_out, 3))
         gain = misfit(samples.held_out) - misfit(read.held_out)
         if min(gain, misfit(samples.share) - misfit(read.share)) < CERTAIN:
             return
         yield Best(best, tuple(alike[1:]), gain, samples.held_out, read.held_out)
         samples = read
-
-DEBUG=0

@@ -31,6 +31,7 @@ _MASS, _MOMENT = 20.0, 10.0  # [kg], [kg m] prior standard deviations of a paylo
 _WORSE = 0.25  # allowed increase of a torque's misfit over its own fit, in variances
 _OTHER_UNIT = 30.0  # a common scale of all torques farther from 1 is another unit, no gain
 _SCALES = np.logspace(-3, 3, 61)
+_ALIKE = _SCALES[2] / _SCALES[0]  # ratio below which two factors on this grid are equal
 _WRONG_TILT = 30.0  # [deg] angle of gravity from the stated one that is an error
 _LARGE = 0.08  # payload over the arm's mass that errors of the links do not explain
 _MISMATCH = 7.5  # largest sum of squared errors of the links, in standard deviations
@@ -242,20 +243,15 @@ def _check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
     bodies = len(probe.model.layout.bodies)
     _, theta, error = model.fit(ones)
     if not model.is_this_robot(ones):
-        chi = model.misfits(_SCALES[:, None] * ones)
-        factor = float(_SCALES[np.argmin(chi)])
-        is_other = abs(np.log(factor)) > np.log(NO_ERROR_OF_MASSES)
-        if is_other and model.is_this_robot(factor * ones):
-            is_unit = abs(np.log(factor)) > np.log(_OTHER_UNIT)
-            yield finding(
-                "current_for_torque", name, severity="error" if is_unit else "warning",
-                factor=factor, joints=len(ones), joint=listed(probe.model.joints), also=False,
-            )  # fmt: skip
+        scale = _torque_scales(model)
+        other = np.flatnonzero(np.abs(np.log(scale)) > np.log(NO_ERROR_OF_MASSES))
+        if len(other) and model.is_this_robot(scale):
+            yield from _scaled(probe, scale, _needed(model, scale, other), name)
             return
         if _is_compensated(probe):
             yield finding("gravity_compensated", name, what="robot")
             return
-        if is_other or _error_of_links(theta) > _MISMATCH:
+        if len(other) or _error_of_links(theta) > _MISMATCH:
             factors = dict(zip(probe.model.layout.bodies, theta[:bodies].tolist(), strict=True))
             words = ", ".join(f"{link} {factor:.2g}" for link, factor in factors.items())
             yield finding("urdf_mismatch", name, factors=words, **factors)
@@ -275,6 +271,49 @@ def _is_compensated(probe: Probe) -> bool:
 
 def _error_of_links(theta: Array) -> float:
     return float(np.sum(((theta[:-4] - 1.0) / _SPREAD) ** 2))
+
+
+def _torque_scales(model: LoadModel) -> Array:
+    """Return the factors of the torque columns that reduce the misfit significantly, else 1."""
+    # In rounds: all torques by a factor that no errors of masses explain, or one torque more.
+    n, scale = len(model.R), np.ones(len(model.R))
+    common = _SCALES[np.abs(np.log(_SCALES)) > np.log(NO_ERROR_OF_MASSES)]
+    for _ in range(n):
+        one = np.where(np.eye(n, dtype=bool)[:, None], _SCALES[:, None], scale).reshape(-1, n)
+        trials = np.vstack([scale, np.repeat(common[:, None], n, axis=1), one])
+        chi = model.misfits(trials)
+        if chi[0] - chi.min() < SIGNIFICANT**2:
+            break
+        scale = trials[int(np.argmin(chi))]
+    return np.where(model.R.any(axis=(1, 2)), scale, 1.0)
+
+
+def _needed(model: LoadModel, scale: Array, other: Array) -> Array:
+    """Return the joints whose other scale is needed to fit the torques; all if all are scaled."""
+    if len(other) == len(scale):
+        return other
+    smallest = scale.copy()
+    for j in other:
+        without = np.where(np.arange(len(scale)) == j, 1.0, smallest)
+        if model.is_this_robot(without):
+            smallest = without
+    return np.asarray(other[smallest[other] != 1.0])
+
+
+def _scaled(probe: Probe, scale: Array, other: Array, name: str) -> Iterator[Finding]:
+    joints, factors = [probe.model.joints[j] for j in other], scale[other].tolist()
+    code = "current_for_torque"
+    if len(other) > 1 and np.ptp(np.log(factors)) < np.log(_ALIKE):
+        factor = float(np.exp(np.log(factors).mean()))
+        is_all = len(other) == len(scale)
+        is_unit = is_all and abs(np.log(factor)) > np.log(_OTHER_UNIT)
+        yield finding(
+            code, name, () if is_all else joints, severity="error" if is_unit else "warning",
+            factor=factor, joints=len(other), joint=listed(joints), also=False,
+        )  # fmt: skip
+        return
+    for joint, factor in zip(joints, factors, strict=True):
+        yield finding(code, name, joint, factor=factor, also=False)
 
 
 def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Finding]:

@@ -128,7 +128,9 @@ class _Alteration:
             },
             "torque_scale": {"factor": 1 + x[0], "what": sense, "cure": sense},
             "time_scale": {
-                "factor": 1 + x[0], "speed": np.sqrt(max(1 + x[0], 0.0)), "what": "residual",
+                "factor": 1 + x[0],
+                "speed": np.sqrt(max(1 + x[0], 0.0)),
+                "what": "residual",
                 "cure": "residual",
             },
             "joint_origin": {"named": joint or "a joint"},
