@@ -167,6 +167,16 @@ def test_a_drive_that_is_off_is_no_sign_of_its_torque(ur5, last, severity):
         assert {f.code for f in findings if f.joints == found.joints} == {"drive_off"}
 
 
+def test_a_recording_that_is_fitted_twice_is_named(ur5, short):
+    again = replace(short, path="again.csv", t=short.t + 3.0)
+    (found,) = [
+        f for f in diagnose(ur5, [short, clean_log(ur5, 1, duration=5.0), again], [], SIGNALS)
+        if f.code == "repeated_log"
+    ]  # fmt: skip
+    assert (found.where, found.severity) == ("again.csv", "warning")
+    assert f"the same recording as {short.name}" in found.message
+
+
 # ---- the recordings of other laboratories
 def whole(recordings, monkeypatch, name, *files):
     monkeypatch.setenv("ROBOTID_DATA", str(recordings))
