@@ -49,6 +49,14 @@ def test_data_that_excite_too_little_are_refused_by_least_squares_only(ur5, rng)
     assert not [x for x in found.verdict.reasons if "as large as that of the prior" in x]
 
 
+def test_torques_that_are_all_0_are_refused(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, samples=300)
+    off = replace(log, tau=0.0 * log.tau)
+    with pytest.raises(DataError, match="the torque of every joint is 0 in all fitted logs"):
+        identify(ur5, [off, off], signals=EXACT)
+    identify(ur5, [off, log], signals=EXACT)
+
+
 def test_a_recording_that_was_fitted_does_not_show_what_repeats(rng):
     """Of validation recordings, those that hold fitted rows do not count."""
     arm = RobotModel.from_urdf(ROOT / "urdf" / "planar_2r.urdf")

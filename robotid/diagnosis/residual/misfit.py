@@ -14,7 +14,7 @@ import numpy as np
 from robotid.base.findings import Finding, listed, toml_key
 from robotid.base.typing import Array
 from robotid.diagnosis import decisions
-from robotid.diagnosis.catalogue import finding
+from robotid.diagnosis.catalogue import codes_with, finding
 from robotid.diagnosis.residual.term_trials import Sample, Trials
 from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.estimation.fitting.fitted import Fit
@@ -309,7 +309,10 @@ def settled(before: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Findin
                 evidence={**term.evidence, "replaces": float(len(hypotheses))},
             )
         terms.append(term)
-    return rest + terms
+    # torques in another unit bind the bodies to a wrong prior, whose error looks like a term
+    rescaled = {joint for f in rest if f.code == "current_for_torque" for joint in f.joints}
+    of_drives = [f for f in terms if f.code in codes_with("term") and rescaled.issuperset(f.joints)]
+    return rest + [f.reworded(severity="note") if f in of_drives else f for f in terms]
 
 
 def _explains(term: Finding, hypothesis: Finding) -> bool:

@@ -25,7 +25,7 @@ from robotid.robot.prior import assumed_masses
 _POSES = 300  # at which gravity is compared
 _LOADED = 0.02  # share of the largest gravity torque above which a joint is compared
 _HELD_BACK = 1.5  # residual over that of WLS beyond which the prior determines the result
-_ANOTHER = 0.35  # difference of gravity and total mass from which on they contradict the scale
+_ANOTHER = 0.25  # difference of gravity and total mass from which on they contradict the scale
 _CLEARLY = 4.0  # distance of a common factor from 1 over the share of gravity that it leaves
 _TOTAL = "total mass"
 _ABSORBS = 0.1  # share of a change of a stated mass that a link takes up to be named
@@ -190,6 +190,12 @@ class ScaleCheck:
             return has_mass and not self._is_total_open and least > _ANOTHER * before
         is_any = self._ratios_whole if has_mass else self.scale is not None
         return bool(is_any) and self._off(has_mass=has_mass) > _ANOTHER
+
+    @property
+    def is_far(self) -> bool:
+        """Whether the scale is contradicted, or far from the URDF's without a known mass."""
+        is_open = self.scale is not None and not (self._decisive or self.assumed)
+        return self.contradicts or (is_open and self._off() > _ANOTHER)
 
     @property
     def _is_urdf(self) -> bool:

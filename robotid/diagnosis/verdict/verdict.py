@@ -15,7 +15,7 @@ from robotid.base.exceptions import SettingsError
 from robotid.base.findings import Finding, listed, not_ignored, quoted
 from robotid.base.settings import require_kind
 from robotid.diagnosis.catalogue import codes_with, reason_of, sentence_of
-from robotid.diagnosis.decisions import BETTER
+from robotid.diagnosis.decisions import BETTER, NO_ERROR_OF_MASSES
 from robotid.diagnosis.verdict.scale_check import ScaleCheck
 from robotid.estimation.fitting.evaluation import JointMetrics, Metrics, logs_that_test
 
@@ -229,10 +229,12 @@ def _judge_joint(
 
 def uses_of_torques(
     joints: Mapping[str, str], *, is_consistent: bool, is_static: bool, log_errors: Sequence[str],
-    scale_check: ScaleCheck | None,
+    scale_check: ScaleCheck | None, inaccurate: Collection[str] = (),
 ) -> dict[str, str]:  # fmt: skip
     """Return what a result with predicted torques can be used for: "yes" or "no", and why."""
     # Inertials need consistency and the scale; a payload joints that gravity loads, and the scale.
+    poor = [joint for joint, status in joints.items() if status == "poor"]
+    joints = {**joints, **dict.fromkeys(inaccurate, "poor")}
     predicted, gravity = _predicted(joints), () if scale_check is None else scale_check.gravity
     loaded = {joint: status for joint, status in joints.items() if joint in gravity}
     if log_errors:
@@ -246,8 +248,8 @@ def uses_of_torques(
         payload = payload if is_scaled else _with(payload, _UNSCALED)
         if not is_consistent:
             inertials = "no, not physically consistent"
-        elif "poor" in joints.values():
-            inertials = f"no, torques of {_named(joints, 'poor')} are poor"
+        elif poor:
+            inertials = f"no, torques of {listed(poor, NAMED)} are poor"
     if is_static:
         predicted = _with(predicted, "at rest and in slow motion")
         inertials = "no, inertias are the URDF's" if inertials.startswith("yes") else inertials
@@ -353,21 +355,21 @@ def judge(
         evidence[warning.joint].poor.extend((2, text) for text in _described([warning]))
     stated, warnings = warnings, [warning for warning in warnings if warning not in costly]
     largest = sorted(evidence.values(), key=lambda one: -max(one.errors, default=0.0))
-    is_contradicted = scale_check is not None and scale_check.contradicts
+    is_far = scale_check is not None and scale_check.is_far
     scale = [] if scale_check is None else [scale_check.message]
     reasons = [
         *predictions.untested(),
         *(caution for one in largest for caution in one.cautions),
         *predictions.better_by_urdf({w.joint for w in warnings if w.code == "gain_change"}),
         *_described(warnings),
-        *(scale if is_contradicted else []),
+        *(scale if is_far else []),
         *predictions.at_rest(),
         *determined.warnings(),
     ]
     notes = [
         *determined.notes(),
         *predictions.of_base(),
-        *([] if is_contradicted else scale),
+        *([] if is_far else scale),
         *([f"{listed(hidden)}: {_HIDDEN}: not evaluated"] if hidden else []),
         *([_STATIC] if determined.is_static else []),
     ]
@@ -387,11 +389,11 @@ def judge(
     per_joint |= {joint: JointVerdict("not evaluated", (_HIDDEN,)) for joint in hidden}
     if cause_of is not None:
         notes = [*_largest_error(per_joint, evidence, cause_of), *notes]
-    worst = max((error for one in evidence.values() for error in one.errors), default=0.0)
+    errors = {joint: max(one.errors, default=0.0) for joint, one in evidence.items()}
     good = (
         f"torque prediction error on {logs_that_test(predictions.validation)}: at most "
-        f"{worst:.1f} % at every joint, smaller than that of a constant and that of the URDF; all "
-        "parameters are physically consistent"
+        f"{max(errors.values(), default=0.0):.1f} % at every joint, smaller than that of a "
+        "constant and that of the URDF; all parameters are physically consistent"
     )
     poor = _ranked(reason for one in largest for reason in one.poor)
     verdict = concluded(
@@ -400,7 +402,7 @@ def judge(
     uses = uses_of_torques(
         {joint: per_joint[joint].status for joint in evidence}, scale_check=scale_check,
         is_consistent=determined.is_consistent, is_static=determined.is_static,
-        log_errors=log_errors,
+        log_errors=log_errors, inaccurate=[x for x, error in errors.items() if error > GOOD],
     )  # fmt: skip
     return replace(verdict, warnings=tuple(stated), use_for=uses)
 
@@ -543,9 +545,13 @@ def _warnings(finding: Finding, joints: Sequence[str]) -> Iterator[VerdictWarnin
     if finding.code in codes_with("of_body"):
         yield VerdictWarning(finding.code, "", message)
         return
-    is_costly = finding.code == "constraint_costs" and finding.evidence["error_pct"] > COSTLY
+    factor, costs = finding.evidence.get("factor", 1.0), finding.evidence.get("error_pct", 0.0)
+    is_poor = {
+        "constraint_costs": costs > COSTLY,
+        "current_for_torque": max(factor, 1.0 / factor) > NO_ERROR_OF_MASSES,
+    }.get(finding.code, False)
     for joint in named:
-        yield VerdictWarning(finding.code, joint, message, "poor" if is_costly else "usable")
+        yield VerdictWarning(finding.code, joint, message, "poor" if is_poor else "usable")
     if not named:
         where = finding.log or finding.where
         where = "" if finding.where in _OF_THE_FIT else f"{where}: "

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from robotid.base.exceptions import NotConvergedError, RankDeficientError, SettingsError
+from robotid.base.exceptions import DataError, NotConvergedError, RankDeficientError, SettingsError
 from robotid.base.tolerances import CONVERGED
 from robotid.base.typing import Array
 from robotid.dynamics.base_parameters import BaseMapping
@@ -417,6 +417,11 @@ def _ground(
         for parts in (reductions if is_last else ())
     )
     factors, share = reduction.factors, recordings.share
+    if not any(R[:, -1].any() for R in factors.triangles):
+        raise DataError(
+            "the torque of every joint is 0 in all fitted logs, which identifies nothing; check "
+            "which columns have the torques, and whether the drives were on"
+        )
     if spread is None:
         spread = prior_spread(model, reduction.squares, reduction.samples)
     rough = WLS(mapping.to_base(prior), share, recordings.levels).fit(factors)

@@ -265,6 +265,13 @@ def test_a_term_stands_for_what_the_doctor_guessed_of_its_torque(three):
     ))  # fmt: skip
 
 
+def test_a_term_of_a_torque_in_another_unit_is_a_note():
+    unit = Finding("current_for_torque", "warning", f"run.csv: {PAN}", "", joints=(PAN,))
+    terms = [Finding("coupling", "warning", x, "It is.", joints=(x,)) for x in (PAN, LIFT)]
+    assert [f.severity for f in settled([unit], terms)] == ["warning", "note", "warning"]
+    assert settled([], terms) == terms
+
+
 def test_a_log_too_short_to_judge_by_is_not_judged(three):
     log = log_with(three, 1, "spring", 2, duration=8.0)
     signals = SignalSettings(cutoff=2.0)

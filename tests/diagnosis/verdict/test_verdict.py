@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 
 from robotid.base.findings import Finding
-from robotid.diagnosis.verdict.scale_check import ScaleCheck
+from robotid.diagnosis.verdict.scale_check import ScaleCheck, StatedMass
 from robotid.diagnosis.verdict.verdict import (
     Determined,
     Predictions,
@@ -358,10 +358,42 @@ def uses(*statuses, scale_check=VERIFIED, **changes):
         (("good",) * 3, VERIFIED, {"is_static": True},
          ("yes, at rest and in slow motion", "no, inertias are the URDF's", "yes")),
         (("good",) * 3, VERIFIED, {"log_errors": ("x",)}, ("no, errors of the recordings",) * 3),
+        (("good", "usable", "good"), VERIFIED, {"inaccurate": ["b"]}, ("yes, without b",) * 3),
     ],
 )  # fmt: skip
 def test_uses_follow_from_joints_consistency_and_scale(statuses, scale_check, changes, wanted):
     assert uses(*statuses, scale_check=scale_check, **changes) == wanted
+
+
+def test_no_use_contradicts_the_error_of_a_joint():
+    logs = {"val.csv": Metrics({"a": joint(15.1), "b": joint(14.9)}, 1.0)}
+    found = judged(Metrics({"a": joint(14.0), "b": joint(14.0)}, 1.0), logs, scale_check=VERIFIED)
+    assert {name: one.status for name, one in found.joints.items()} == {"a": "usable", "b": "good"}
+    assert set(found.use_for.values()) == {"yes, without a"}
+
+
+@pytest.mark.parametrize(
+    ("factor", "mass", "status"),
+    [(1.24, 24.8, "good"), (1.26, 20.0, "usable"), (0.74, 15, "usable")],
+)
+def test_a_scale_far_from_that_of_a_complete_urdf_is_not_good(factor, mass, status):
+    # even if errors of the URDF's links may explain the common factor
+    far = ScaleCheck(
+        scale=factor, factor=factor, masses=(20.0, mass, 0.0), common=(factor, 0.5), mass_error=9.0
+    )
+    assert not far.contradicts
+    found = verdict({"a": joint(4.0)}, scale_check=far)
+    assert found.status == status
+    assert ("absolute scale not verified" in found.reasons[0]) is (status == "usable")
+    for known in ({"assumed": 2}, {"stated": StatedMass(("total_mass",), 1.0, 0.01)}):
+        sure = replace(far, **known)
+        assert verdict({"a": joint(4.0)}, scale_check=sure).status == "good"
+
+
+@pytest.mark.parametrize(("factor", "effect"), [(0.001, "poor"), (0.4, "usable"), (3.1, "poor")])
+def test_a_torque_in_another_unit_is_poor(factor, effect):
+    found = warnings_of([finding("current_for_torque", "run.csv: a, b", factor=factor)], JOINTS)
+    assert [(one.joint, one.effect) for one in found] == [("a", effect), ("b", effect)]
 
 
 def test_the_scale_of_positions_comes_from_a_torque_only():
