@@ -151,6 +151,9 @@ def test_a_payload_is_weighed(ur5):
     (found,) = [f for f in findings if f.code == "payload"]
     assert loud(findings) == {"payload"}
     assert abs(found.evidence["mass"] - 4.2) < 3 * found.evidence["std_error"]
+    # the load explains more of the torques than the sign of one of them does
+    reversed_wrist = replace(log, tau=log.tau * [1, 1, 1, -1, 1, 1])
+    assert "torque_sign" in loud(diagnose(ur5, [reversed_wrist], [], SIGNALS))
 
 
 @pytest.mark.parametrize(("last", "severity"), [(1000, "error"), (300, "warning")])

@@ -208,8 +208,6 @@ def test_the_doctor_names_rounded_angles_that_matter_once(tmp_path, rng):
 
 UNUSABLE = {
     "missing": (None, "there is no URDF file"),
-    "no XML": ("<robot", "is not well-formed XML"),
-    "other XML": ("<sdf/>", "the top element is <sdf>, wanted <robot>"),
     "no name": ("<robot/>", "<robot> has no name"),
     "no joint": ('<robot name="r"><link name="l"/></robot>', "has no movable joint"),
 }
