@@ -61,6 +61,9 @@ def diagnose(
     first = [one.motion for one in examined[: len(fitted)] if one.motion is not None]
     probes = [one.probe for one in examined[: len(fitted)] if one.probe is not None]
     mapping = structural_mapping(model) if probes else None
+    for k, log in enumerate(fitted):
+        same = [x.name for x in fitted[:k] if np.array_equal([x.q, x.tau], [log.q, log.tau])]
+        findings += [finding("repeated_log", log.name, other=same[0])] if same else []
     moving = [probe.motion for probe in probes]
     segments: list[Reduction] = []  # of the fitted motions, made if they are compared
     for one in examined[len(fitted) :]:
