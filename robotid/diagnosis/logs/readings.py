@@ -17,10 +17,8 @@ from itertools import combinations, pairwise, product
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 
 from robotid.base.typing import Array
-from robotid.diagnosis.decisions import NO_ERROR_OF_MASSES
 from robotid.diagnosis.logs.channels import ZERO
 from robotid.diagnosis.logs.probe import Probe, drive_columns
 from robotid.dynamics.rows import inertial_rows, joint_constants
@@ -128,10 +126,7 @@ class Samples:
         spread = prior_spread(model, np.ones((3, model.n_rows)), 1)[: model.layout.n_inertial]
         at = probe.q, probe.v, probe.a, probe.tau, _variation(probe.tau)
         motion = _Motion(model, *at, rows, _LOOSE * spread, one, one)
-        samples = cls(motion, np.arange(len(one)), one, one)
-        gain = samples.gain_without(tuple(rows))  # of all of them: they may have another unit
-        is_other = gain > 0.0 and abs(np.log(gain)) > np.log(NO_ERROR_OF_MASSES)
-        return replace(samples, gain=gain * one) if is_other else samples
+        return cls(motion, np.arange(len(one)), one, one)
 
     def few(self) -> "Samples":
         """Return some of the instants, in one segment."""
@@ -204,6 +199,12 @@ class Samples:
         for segment in products:
             left += _left(segment, _fitted(whole - segment, size, len(self.motion.q)))
         return _over(left, size)
+
+    @property
+    def unexplained(self) -> Array:
+        """The same share of torques with their signs, at most 1, (m,)."""
+        m, own = self.motion, self.order[self.motion.rows]
+        return np.minimum(_over(self.held_out * m.size[own], _variation(m.tau)[own]), 1.0)
 
 
 def _variation(tau: Array) -> Array:
@@ -326,11 +327,12 @@ def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
     for j in samples.unsigned:
         yield Reading("unsigned_torque", (j,), partial(_signed, j=j))
     wrists = (tuple(rows[first:]) for first in range(1, len(rows) - 1))
-    for group in [*zip(rows, strict=True), *wrists]:
+    for group in [tuple(rows), *zip(rows, strict=True), *wrists]:
         gain = samples.gain_without(group)
         if gain > 0.0:
             scaled = partial(_scaled, on=one[list(group)].sum(axis=0))
-            yield Reading("current_for_torque", group, scaled, (float(np.log(gain)),), 0.3)
+            named = group if len(group) < len(rows) else every  # another unit
+            yield Reading("current_for_torque", named, scaled, (float(np.log(gain)),), 0.3)
     for j in turning:
         for offset in (np.pi / 2, -np.pi / 2, np.pi, _OFFSET, -_OFFSET):
             yield Reading("position_offset", (j,), partial(_shifted, on=one[j]), (offset,), 0.1)
@@ -404,9 +406,10 @@ def _turned(samples: Samples, j: int, turn: tuple[Array, bool]) -> Samples:
 def _quarters(model: RobotModel, j: int) -> Iterator[tuple[Array, bool]]:
     """Yield turns of a joint's axis by a quarter, and whether what it carries turns with it."""
     axis = joint_constants(model.pin_model, model.pin_model.getJointId(model.joints[j]))[-3:]
-    for about, quarter, is_carried in product(range(3), (1, -1), (False, True)):
-        if abs(axis[about]) < 0.5:
-            yield pin.utils.rotate("xyz"[about], quarter * np.pi / 2), is_carried
+    for about, quarter, is_carried in product(np.eye(3), (1, -1), (False, True)):
+        if abs(about @ axis) < 0.5:
+            rotation = np.outer(about, about) + quarter * np.cross(about, np.eye(3))
+            yield rotation, is_carried
 
 
 def _signed(samples: Samples, j: int) -> Samples:
@@ -464,5 +467,5 @@ def best_readings(samples: Samples) -> Iterator[Best]:
         gain = misfit(samples.held_out) - misfit(read.held_out)
         if min(gain, misfit(samples.share) - misfit(read.share)) < CERTAIN:
             return
-        yield Best(best, tuple(alike[1:]), gain, samples.held_out, read.held_out)
+        yield Best(best, tuple(alike[1:]), gain, samples.unexplained, read.unexplained)
         samples = read

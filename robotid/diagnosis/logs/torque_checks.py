@@ -99,8 +99,9 @@ def _findings(samples: Samples, found: Sequence[Best], log: str) -> Iterator[Fin
     for one in found:
         reading = one.reading
         concerned = np.isin(rows, reading.joints) | (not reading.joints)
-        if np.median(final[concerned]) > EXPLAINED:
-            continue
+        is_unit = reading.code == "current_for_torque" and not reading.joints
+        if is_unit or np.median(final[concerned]) > EXPLAINED:
+            continue  # a unit of all torques shows in the masses
         if reading.code in _ORDERS:
             exchanged.setdefault(reading.code, []).append(one)
         elif reading.code in ("torque_sign", "unsigned_torque"):
