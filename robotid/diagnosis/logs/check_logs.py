@@ -50,6 +50,9 @@ def diagnose(
     first = [motion for motion, _ in motions[: len(fitted)] if motion is not None]
     probes = [probe for _, probe in motions[: len(fitted)] if probe is not None]
     mapping = structural_mapping(model) if probes else None
+    for k, log in enumerate(fitted):
+        same = [x.name for x in fitted[:k] if np.array_equal([x.q, x.tau], [log.q, log.tau])]
+        findings += [finding("repeated_log", log.name, other=same[0])] if same else []
     moving = [probe.motion for probe in probes]
     segments: list[Reduction] = []  # of the fitted motions, made if they are compared
     for log, (motion, probe) in zip(validation, motions[len(fitted) :], strict=True):

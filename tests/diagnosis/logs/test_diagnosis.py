@@ -151,6 +151,9 @@ def test_a_payload_is_weighed(ur5):
     (found,) = [f for f in findings if f.code == "payload"]
     assert loud(findings) == {"payload"}
     assert abs(found.evidence["mass"] - 4.2) < 3 * found.evidence["std_error"]
+    # the load explains more of the torques than the sign of one of them does
+    reversed_wrist = replace(log, tau=log.tau * [1, 1, 1, -1, 1, 1])
+    assert "torque_sign" in loud(diagnose(ur5, [reversed_wrist], [], SIGNALS))
 
 
 @pytest.mark.parametrize(("last", "severity"), [(1000, "error"), (300, "warning")])
@@ -165,6 +168,16 @@ def test_a_drive_that_is_off_is_no_sign_of_its_torque(ur5, last, severity):
     assert found.evidence["ratio"] < 0.02
     if severity == "error":
         assert {f.code for f in findings if f.joints == found.joints} == {"drive_off"}
+
+
+def test_a_recording_that_is_fitted_twice_is_named(ur5, short):
+    again = replace(short, path="again.csv", t=short.t + 3.0)
+    (found,) = [
+        f for f in diagnose(ur5, [short, clean_log(ur5, 1, duration=5.0), again], [], SIGNALS)
+        if f.code == "repeated_log"
+    ]  # fmt: skip
+    assert (found.where, found.severity) == ("again.csv", "warning")
+    assert f"the same recording as {short.name}" in found.message
 
 
 # ---- the recordings of other laboratories
