@@ -220,6 +220,10 @@ class TorqueSlopes(NamedTuple):
     by_a: Array  # by the accelerations, likewise: the mass matrix of the bodies
     by_gravity: Array  # by gravity, along the axes of the world, shape (N, n, 3)
     by_origin: Array  # by each joint's origin in the body before, (N, n, n, 3): torque, joint, axis
+    by_turn: (
+        Array  # by turning each joint about its origin, with its axis, along its axes, likewise
+    )
+    by_force: Array  # by a force on the last body's tip, along the axes of the world, (N, n, 3)
 
 
 def predict(
@@ -415,44 +419,64 @@ def _torque_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -
     plain, G = model.with_parameters(pi).pin_model, model.velocity_map
     extended, joints = _with_movable_origins(plain)
     own = np.array([extended.joints[k].idx_v for k in joints])  # rows of the robot's own joints
-    before = np.array([extended.joints[k - 1].idx_v for k in joints])  # and of their origins
+    before = np.array([extended.joints[k - 1].idx_v for k in joints])  # and of their places
     first_q = [(extended.joints[k].idx_q, plain.joints[i].idx_q, plain.joints[i].nq)
                for i, k in enumerate(joints, start=1)]  # fmt: skip
-    configurations = np.zeros((len(q), extended.nq))
+    configurations = np.tile(pin.neutral(extended), (len(q), 1))
     known = model.configurations(q)
     for to, here, size in first_q:
         configurations[:, to : to + size] = known[:, here : here + size]
     velocities, accelerations = np.zeros((2, len(v), extended.nv))
     velocities[:, own], accelerations[:, own] = v @ G.T, a @ G.T
     slopes = np.empty((3, len(q), len(own), extended.nv))
+    twists, at, tip = np.empty((len(q), 6, len(own))), np.empty((len(q), 3)), _tip(plain)
     derive, data = pin.computeRNEADerivatives, extended.createData()
     states = zip(configurations, velocities, accelerations, strict=True)
-    for D_q, D_v, D_a, state in zip(*slopes, states, strict=True):
+    for D_q, D_v, D_a, J, p, state in zip(*slopes, twists, at, states, strict=True):
         by_q, by_v, by_a = derive(extended, data, *state)
         by_q.take(own, 0, D_q, "clip")  # without bound checks
         by_v.take(own, 0, D_v, "clip")
         by_a.take(own, 0, D_a, "clip")
+        data.J.take(own, 1, J, "clip")
+        p[:] = data.oMi[joints[-1]].act(tip)
     D: Array = G.T @ slopes  # tau = G^T tau_pinocchio
     by_q, by_v, by_a = D[..., own] @ G
     leaders = np.array([plain.getJointId(name) - 1 for name in model.joints])
-    axes = before[leaders][:, None] + np.arange(3)
-    roots = before[[plain.parents[i] == 0 for i in range(1, plain.njoints)]]
-    falling = sum(D[2][..., root : root + 3] for root in roots)  # as the base is accelerated
-    return by_q, by_v, by_a, -falling, D[0][..., axes]
+    first = before[leaders][:, None]
+    rotations = np.array([plain.jointPlacements[i + 1].rotation for i in range(len(before))])
+    by_origin = np.einsum("Nnjk,jik->Nnji", D[0][..., first + range(3)], rotations[leaders])
+    roots = [i for i in range(len(before)) if plain.parents[i + 1] == 0]
+    falling = [D[2][..., before[i] + np.arange(3)] @ rotations[i].T for i in roots]
+    moved = twists[:, :3] + np.cross(twists[:, 3:], at[:, :, None], axis=1)  # the tip, (N, 3, n)
+    carries = np.isin(range(1, plain.njoints), plain.supports[plain.njoints - 1])
+    by_force = -moved.swapaxes(1, 2) * carries[:, None]
+    # gravity acts as an acceleration of the base in the opposite direction
+    return (
+        by_q,
+        by_v,
+        by_a,
+        -sum(falling),
+        by_origin,
+        D[0][..., first + range(3, 6)],
+        G.T @ by_force,
+    )
+
+
+def _tip(model: pin.Model) -> Array:
+    """Return the farthest frame of the last body from its joint, (3,) [m]."""
+    places = [x.placement.translation for x in model.frames if x.parentJoint == model.njoints - 1]
+    return np.asarray(max(places, key=np.linalg.norm, default=np.zeros(3)))
 
 
 def _with_movable_origins(model: pin.Model) -> tuple[pin.Model, list[int]]:
-    """Return a robot with a 3-axis prismatic joint before each joint, and its own joints in it."""
+    """Return a robot with a 6-axis joint before each joint, and its own joints in it."""
     extended, joints = pin.Model(), [0]
     extended.gravity = model.gravity
     for i in range(1, model.njoints):
         place, name = model.jointPlacements[i], model.names[i]
-        there = pin.SE3(np.eye(3), place.translation)
-        origin = extended.addJoint(
-            joints[model.parents[i]], pin.JointModelTranslation(), there, f"{name} origin"
-        )
-        rotated = pin.SE3(place.rotation, np.zeros(3))
-        joints.append(extended.addJoint(origin, model.joints[i], rotated, name))
+        parent = joints[model.parents[i]]
+        free = extended.addJoint(parent, pin.JointModelFreeFlyer(), place, f"{name} place")
+        joints.append(extended.addJoint(free, model.joints[i], pin.SE3.Identity(), name))
         extended.appendBodyToJoint(joints[-1], model.inertias[i], pin.SE3.Identity())
     return extended, joints[1:]
 
