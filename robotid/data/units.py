@@ -188,7 +188,7 @@ def _velocity_factor(log: Log) -> Array:
     """Return f with dq = f d(q)/dt for each joint, shape (n,); NaN if they do not correlate."""
     if log.v is None or len(log.t) <= 10:
         return np.full(len(log.joints), np.nan)
-    moved, integral = _displacements(log, log.v)
+    moved, integral = displacements(log, log.v)
     both, *squares = (np.sum(x * y, axis=0) for x, y in (
         (moved, integral), (moved, moved), (integral, integral)
     ))  # fmt: skip
@@ -197,7 +197,7 @@ def _velocity_factor(log: Log) -> Array:
     return np.asarray(np.copysign(factor, both))
 
 
-def _displacements(log: Log, v: Array) -> tuple[Array, Array]:
+def displacements(log: Log, v: Array) -> tuple[Array, Array]:
     """Return displacements over short segments by positions and by speeds, (K, n), but jumps."""
     dt, step = np.diff(log.t)[:, None], np.diff(log.q, axis=0)
     median = float(np.median(dt))
@@ -282,7 +282,7 @@ def coarse_velocities(log: Log) -> tuple[str, ...]:
 def unlike_velocities(log: Log) -> dict[str, float]:
     """Joints whose measured velocity is not the derivative of their position at any lag."""
     v, dt = _measured(log), np.diff(log.t)
-    moved, integral = _displacements(log, v)
+    moved, integral = displacements(log, v)
     length, median = len(dt) - len(moved) + 1, float(np.median(dt))
     last = min(round(_LONGEST / median), len(moved) // 2)
     shifts = [k for k in range(-last, last + 1, max(length // 2, 1)) if abs(k) < len(moved) // 2]

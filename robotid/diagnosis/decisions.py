@@ -78,7 +78,8 @@ CORRELATED = 0.95
 #: torque scale; and from which one is reported, or a standard error is too large to use a value.
 AGREES = 0.05
 DIFFERS = 2 * AGREES
-#: Factor beyond which a torque or a total mass is no error of the URDF's masses.
+#: Factor beyond which a torque or a total mass is no error of the URDF's masses, and a torque or
+#: a motion no error of its limits.
 NO_ERROR_OF_MASSES = 3.0
 #: Ratio of the residuals of two explanations below which the first is clearly the better one.
 BETTER = 0.5

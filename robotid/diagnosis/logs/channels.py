@@ -1,10 +1,10 @@
 """Checks of time stamps, motion, sensors and torque channels of a log; no model of the robot."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from robotid.base.findings import Finding, listed, quoted
+from robotid.base.findings import Finding, listed, quoted, toml_key
 from robotid.base.text import seconds
 from robotid.base.typing import Array
 from robotid.data import units
@@ -13,8 +13,20 @@ from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.units import AT_REST, STATIC, STILL
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import AGREES, BEYOND_NOISE, DIFFERS, SHARE_OF_ROWS
+from robotid.diagnosis.decisions import (
+    AGREES,
+    BETTER,
+    BEYOND_NOISE,
+    CORRELATED,
+    DIFFERS,
+    FEWEST,
+    NO_ERROR_OF_MASSES,
+    ROWS,
+    SEGMENTS,
+    SHARE_OF_ROWS,
+)
 from robotid.robot.parameters import ParameterLayout
+from robotid.robot.tree import Joint
 
 MOVING = 0.1  # Share of the log in which a joint must move
 ZERO = 0.05  # Share of its largest value, below which a torque that is never negative is 0
@@ -26,10 +38,10 @@ _ABSURD = 5.0  # ... above which it is no motion
 _HARM = 0.02  # share of the energy of its channel with which it ruins a least-squares fit
 _NOISY = 0.3  # noise over signal from which a torque is uninformative
 _LAG = 0.002  # [s] a shorter lag is not reported
-_ALIKE = 0.8  # least correlation of a velocity with the derivative of its position
 _BITS = range(9, 24)  # of encoders
 _ENCODER = 0.01  # [bits] difference of a step from 2 pi / 2^bits
-_DEAD = 1e-3  # velocity over d(q)/dt below which the channel is constant
+_CLOCK = 0.01  # relative error of the clock from which it is reported: 2 % of an inertia
+_RPM = 30 / np.pi  # [1/min per rad/s]
 _LONG = 0.05  # [s] a longer gap is a warning
 _BUNCHED = 0.2  # [mean steps] a shorter step is of rows that were stamped together ...
 _CLOCK_ALIKE = 0.3  # ... if more than this share of the mean motion per row is in them
@@ -39,6 +51,8 @@ _PAUSE = 1.0
 _STALE = 0.05  # share of stale rows from which they are a warning
 _CONTINUES = 0.15  # motion after repeated rows, over that in as many rows before and after ...
 _AROUND = 10  # ... at most so many rows of each
+_LENGTHS = {"": 1.0, "mm": 1e-3, "cm": 1e-2}  # [m]
+_ANGLES = {"": 1.0, "degrees": np.pi / 180}  # [rad]
 _HARDLY = {"rad": 0.2, "m": 0.05}  # smaller range: the joint hardly moves
 _PLATEAU = 5  # consecutive rows at the limit of a clipped channel ...
 _CLIPPED = 0.01  # ... and share of all rows
@@ -61,14 +75,13 @@ def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
     for kind, values in channels.items():
         yield from _noise(log, kind, values, noise[kind])
     if log.v is not None:
-        slope, v = _slopes(log, log.v)
-        alike = _correlation(slope, v)  # (n, n): position j, velocity k
-        exchanged = list(_velocity_order(log, alike))
+        moved, integral = units.displacements(log, log.v)
+        exchanged = list(_velocity_order(log, moved, integral))
         yield from exchanged
         if not exchanged:
             yield from _unlike_velocity(log, signals.velocity)
         yield from _velocity_delay(log, signals.velocity_delay)
-        yield from _velocity_scale(log, slope, v, np.diag(alike), signals.velocity)
+        yield from _velocity_scale(log, moved, integral, signals.velocity)
 
 
 def _quantisation(log: Log, kind: str, values: Array, velocity: str) -> Iterator[Finding]:
@@ -133,14 +146,18 @@ def _noise(log: Log, kind: str, values: Array, noise: Array) -> Iterator[Finding
         yield finding("noisy_torque", log.name, log.joints[j], share=share[j])
 
 
-def _velocity_order(log: Log, alike: Array) -> Iterator[Finding]:
+def _velocity_order(log: Log, moved: Array, integral: Array) -> Iterator[Finding]:
     """Yield joints whose measured velocity is the derivative of another joint's position."""
-    for j, joint in enumerate(log.joints):
-        k = int(np.argmax(alike[j]))
+    a, b = moved - moved.mean(axis=0), integral - integral.mean(axis=0)
+    size = np.outer(np.linalg.norm(a, axis=0), np.linalg.norm(b, axis=0))
+    alike = np.divide(a.T @ b, size, out=np.zeros_like(size), where=size > 0)  # position, velocity
+    for j, k in enumerate(np.argmax(alike, axis=1).tolist()):
         largest, own = alike[j, k], alike[j, j]
-        if k != j and largest >= _ALIKE and own <= 0.5 * largest:
+        if k != j and largest >= CORRELATED and own <= BETTER * largest:
             evidence = {"correlation": largest, "own_correlation": own}
-            yield finding("velocity_order", log.name, joint, other=log.joints[k], **evidence)
+            yield finding(
+                "velocity_order", log.name, log.joints[j], other=log.joints[k], **evidence
+            )
 
 
 def _unlike_velocity(log: Log, velocity: str) -> Iterator[Finding]:
@@ -169,34 +186,65 @@ def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
     )  # fmt: skip
 
 
-def _velocity_scale(
-    log: Log, slope: Array, v: Array, alike: Array, velocity: str
-) -> Iterator[Finding]:
-    """Yield measured velocities that are a multiple of d(q)/dt, or constant."""
-    # It lies between the slopes of the regressions of v on d(q)/dt, and inverse, for any noise.
-    slope, v = slope - slope.mean(axis=0), v - v.mean(axis=0)
+def _velocity_scale(log: Log, moved: Array, integral: Array, velocity: str) -> Iterator[Finding]:
+    """Yield the factor of the clock, if all velocities have one, and velocities with another."""
     severity = {"differentiated": "note", "auto": "error" if log.has_torque else "warning"}
-    for j, joint in enumerate(log.joints):
-        a, b, ab = slope[:, j] @ slope[:, j], v[:, j] @ v[:, j], slope[:, j] @ v[:, j]
-        moves = np.ptp(log.q[:, j]) > _LEAST["q"] and np.sqrt(a / len(v)) > _LEAST["dq"]
-        is_dead = bool(moves and b < _DEAD**2 * a)
-        is_alike = bool(moves and not is_dead and alike[j] > _ALIKE)
-        if is_dead or (is_alike and (ab / a > 1 + DIFFERS or b / ab < 1 / (1 + DIFFERS))):
-            yield finding(
-                "velocity_scale", log.name, joint, severity=severity.get(velocity, "error"),
-                what=is_dead, factor=0.0 if is_dead else float(np.sqrt(b / a)),
-            )  # fmt: skip
+    factors: dict[int, tuple[float, float]] = {}  # by joint, and its relative standard error
+    for j in np.flatnonzero(np.ptp(log.q, axis=0) > STATIC).tolist():
+        if np.ptp(log.v[:, j]) == 0.0:
+            factors[j] = 0.0, 0.0
+        elif (known := _factor(moved[:, j], integral[:, j])) is not None:
+            factors[j] = known
+    every = np.array([*factors.values()])
+    is_known = len(factors) > 1 or len(log.joints) == 1
+    factor, error = _common(*every.T) if is_known else (1.0, 0.0)
+    least = DIFFERS if units.coarse_velocities(log) else _CLOCK  # steps may be truncated
+    if abs(factor / _RPM - 1.0) < _CLOCK:
+        factor = 1.0  # a unit of the velocities
+    elif abs(factor - 1.0) > max(least, BEYOND_NOISE * error):
+        yield finding(
+            "time_scale:velocities", log.name, factor=factor, std_error=error,
+            severity="error" if abs(factor - 1.0) > DIFFERS else "warning",
+        )  # fmt: skip
+    other = {
+        j: own for j, (own, error) in factors.items()
+        if abs(own / factor - 1.0) > DIFFERS + BEYOND_NOISE * error
+    }  # fmt: skip
+    while other:
+        own = next(iter(other.values()))
+        alike = [j for j, x in other.items() if abs(x - own) <= AGREES * own]
+        yield finding(
+            "velocity_scale", log.name, [log.joints[j] for j in alike], factor=own,
+            severity=severity.get(velocity, "error"), what=own == 0.0,
+        )  # fmt: skip
+        other = {j: x for j, x in other.items() if j not in alike}
 
 
-def _slopes(log: Log, velocity: Array) -> tuple[Array, Array]:
-    """Return d(q)/dt and the measured velocity, shape (m, n) each, of steps of a usual length."""
-    step = np.diff(log.t)[:, None]
-    median = np.median(step)
-    is_regular = ((step > median / 5) & (step < 5 * median))[:, 0]
-    every = max(1, len(step) // 20000)
-    slope = np.diff(np.unwrap(log.q, axis=0), axis=0) / step
-    v = 0.5 * (velocity[1:] + velocity[:-1])
-    return slope[is_regular][::every], v[is_regular][::every]
+def _factor(moved: Array, integral: Array) -> tuple[float, float] | None:
+    """Return v over d(q)/dt of a joint and the standard error, from displacements (N,)."""
+    # Parts of equal motion are left out in turn; a delay changes both RMS equally.
+    travel = np.cumsum(moved**2)
+    starts = np.unique(np.searchsorted(travel, travel[-1] * np.arange(SEGMENTS) / SEGMENTS))
+    xx, xy, yy = (
+        np.add.reduceat(x * y, starts)
+        for x, y in ((moved, moved), (moved, integral), (integral, integral))
+    )
+    if len(starts) < FEWEST or xy.sum() < CORRELATED * np.sqrt(xx.sum() * yy.sum()):
+        return None
+    without = np.sqrt((yy.sum() - yy) / (xx.sum() - xx))
+    return float(np.sqrt(yy.sum() / xx.sum())), float(np.std(without) * np.sqrt(len(starts) - 1))
+
+
+def _common(factors: Array, errors: Array) -> tuple[float, float]:
+    """Return the factor that most joints share, and its standard error; 1 if they share none."""
+    middle = float(np.median(factors))
+    is_near = np.abs(factors - middle) <= np.maximum(DIFFERS * middle, BEYOND_NOISE * errors)
+    if 2 * is_near.sum() <= len(factors) or middle == 0.0:
+        return 1.0, 0.0
+    near = factors[is_near]
+    return float(near.mean()), float(
+        np.hypot(near.std(), errors[is_near].mean()) / len(near) ** 0.5
+    )
 
 
 def _amplitude(x: Array, smooth: Array, noise: float) -> float:
@@ -224,11 +272,42 @@ def _white_noise(t: Array, values: Array) -> Array:
     return np.asarray(1.48 * np.median(np.abs(differences), axis=0))
 
 
-def _correlation(one: Array, other: Array) -> Array:
-    """Return the correlation of each column with each of the other, shape (n, n)."""
-    a, b = one - one.mean(axis=0), other - other.mean(axis=0)
-    size = np.outer(np.linalg.norm(a, axis=0), np.linalg.norm(b, axis=0))
-    return np.asarray(np.divide(a.T @ b, size, out=np.zeros_like(size), where=size > 0))
+def check_limits(log: Log, limits: Sequence[Joint]) -> Iterator[Finding]:
+    """Yield the joints whose positions or torques are far beyond the limits of the URDF."""
+    every = max(1, len(log.t) // ROWS)
+    for q, joint in zip(log.q[::every].T, limits, strict=True):
+        if not joint.has_limits:
+            continue
+        units = _LENGTHS if joint.type == "prismatic" else _ANGLES
+        extents = {unit: _extent(size * q, joint) for unit, size in units.items()}
+        if extents.pop("") <= NO_ERROR_OF_MASSES:
+            continue
+        fitting = {unit: 100 * units[unit] for unit, x in extents.items() if x <= 1 + DIFFERS}
+        key = toml_key(joint.name)
+        ways = (f"percent = {{ {key} = [0, {x:.4g}] }} ({unit})" for unit, x in fitting.items())
+        yield finding(
+            "beyond_limits", log.name, joint.name, what=bool(fitting), cure=bool(fitting),
+            low=q.min(), high=q.max(), lower=joint.lower, upper=joint.upper,
+            units=" or ".join(fitting), settings=" or ".join(ways),
+            unit="m" if joint.type == "prismatic" else "rad",
+        )  # fmt: skip
+    effort = np.array([x.effort if 0 < x.effort < np.inf else np.nan for x in limits])
+    is_placeholder = len({*effort}) == 1 and np.log10(effort[0]) % 1 == 0
+    if not log.has_torque or is_placeholder:
+        return
+    times = np.quantile(np.abs(log.tau[::every]), 1 - SHARE_OF_ROWS, axis=0) / effort
+    beyond = np.flatnonzero(times > NO_ERROR_OF_MASSES**2)  # of the limit and the torque
+    if len(beyond):
+        names = [log.joints[j] for j in beyond]
+        yield finding("beyond_effort", log.name, names, times=times[beyond].min())
+
+
+def _extent(q: Array, joint: Joint) -> float:
+    """Return the extent of a motion over the range of a joint [-]."""
+    # Of a prismatic joint about the middle of the range: the zero of an encoder is no unit.
+    middle = (joint.lower + joint.upper) / 2 if joint.type == "prismatic" else np.median(q)
+    farthest = np.quantile(np.abs(q - middle), 1 - SHARE_OF_ROWS)
+    return 2 * float(farthest) / (joint.upper - joint.lower)
 
 
 def check_clock(log: Log) -> Iterator[Finding]:
@@ -368,6 +447,9 @@ def _in_motion(log: Log, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
 
 def check_torque_channels(log: Log) -> Iterator[Finding]:
     """Yield the findings on the torque sensors behind a log."""
+    if not log.tau.any():
+        yield finding("constant_torque", log.name, severity="error", kind="all", cure="all")
+        return
     moving = np.append((np.diff(log.q, axis=0) != 0).any(axis=1), False)
     for joint, x in zip(log.joints, log.tau.T, strict=True):
         moves = bool(np.ptp(log.q[:, log.joints.index(joint)]) > STILL)

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 
 from robotid.base.exceptions import DataError, RobotIdError
-from robotid.base.findings import Finding, by_severity, toml_key
+from robotid.base.findings import Finding, by_severity, quoted, toml_key
 from robotid.base.typing import Array
 from robotid.data.log import REPEATED, Log, Trajectory, repeated_share
 from robotid.data.signal_settings import LogUnits, SignalSettings
-from robotid.data.units import STILL
+from robotid.data.units import AT_REST, STILL
 from robotid.diagnosis.catalogue import finding
+from robotid.diagnosis.decisions import BETTER, NOTHING, SCATTERED, SEGMENTS
 from robotid.diagnosis.logs import channels
 from robotid.diagnosis.logs.base_checks import check_base
 from robotid.diagnosis.logs.command_channels import check_commands
@@ -33,6 +34,8 @@ from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread, with_assumed_inertials
 
 _ROWS = 5000  # of a log, from which its excitation is computed
+#: Findings on one torque, which another quantity in its column explains.
+_OF_A_DRIVE = ("current_for_torque", "torque_sign", "unexplained_torque", "unsigned_torque")
 _FAR = 2 * np.pi  # number in a log above which a position may be a percentage
 
 
@@ -82,8 +85,12 @@ def _examine_log(
     name = log.name
     findings += [finding("log_note", name, text=note) for note in log.notes]
     findings += [finding("log_assumption", name, text=text) for text in log.assumed]
+    sensors: list[Finding] = []
     if not model.is_static:  # rows of static poses may have gaps between them
-        findings += [*channels.check_clock(log), *channels.check_channels(log, signals)]
+        sensors = [*channels.check_clock(log), *channels.check_channels(log, signals)]
+        findings += sensors
+    beyond = list(channels.check_limits(log, model.limits))
+    findings += beyond
     prismatic = [limit.name for limit in model.limits if limit.type == "prismatic"]
     findings += check_commands(log, prismatic)
     driven = [joint for joint in log.joints if joint not in model.passive]
@@ -108,13 +115,51 @@ def _examine_log(
     if probe is None:
         findings.append(finding("no_motion", name))
         return motion, None
-    if any(x.severity == "error" for x in sizes):
-        return motion, probe  # torques without signs fit no model
+    clocks = [x for x in sensors if x.code == "time_scale"]
+    if any(x.severity == "error" for x in (*clocks, *sizes)):
+        return motion, probe  # no model fits these torques
     torques = list(check_torques(probe, name))
-    findings += torques
+    others = [x for x in torques if x.severity == "error" and x.code not in _OF_A_DRIVE]
+    moved = {joint for x in others for joint in x.joints}
+    coarse = {joint for x in sensors if x.code == "quantised" for joint in x.joints}
+    off = [x for x in _drives_off(probe, coarse, name) if moved.isdisjoint(x.joints)]
+    findings[:] = [x for x in findings if x not in beyond or moved.isdisjoint(x.joints)]
+    named = {joint for x in (*beyond, *off) if x.severity == "error" for joint in x.joints} - moved
+    torques = [
+        x for x in torques
+        if x.code not in _OF_A_DRIVE or not x.joints or not named.issuperset(x.joints)
+    ]  # fmt: skip
+    findings += [*off, *torques]
     if not any(x.severity == "error" for x in torques):
         findings += check_torque_delay(model, log, signals, name)
     return motion, probe
+
+
+def _drives_off(probe: Probe, coarse: Collection[str], name: str) -> Iterator[Finding]:
+    """Yield the joints that move by the torque of others, in a part of the motion or all of it."""
+    # The torque is about 0 and related to neither the URDF's torque nor the speed.
+    loads, parts = probe.loads().sum(axis=2), np.array_split(np.arange(len(probe.tau)), SEGMENTS)
+    tau, load, speed = (
+        np.array([np.mean(x[rows] ** 2, axis=0) for rows in parts])  # (parts, n)
+        for x in (probe.tau, loads, probe.v)
+    )
+    moves = speed > AT_REST**2
+    is_small = moves & (tau < channels.ZERO * load)
+    for j, joint in enumerate(probe.model.joints):
+        is_all = bool((is_small == moves)[:, j].all())
+        is_off = is_small[:, j] & (is_all | (tau[:, j] < channels.ZERO**2 * tau[:, j].mean()))
+        off = np.flatnonzero(is_off)
+        if len(off) < SCATTERED or (joint in coarse and not is_all):
+            continue
+        rows = np.concatenate([parts[k] for k in off])
+        x = np.column_stack([probe.tau[rows, j], loads[rows, j], probe.v[rows, j]])
+        x = (x - x.mean(axis=0)) / np.maximum(x.std(axis=0), NOTHING)
+        if np.ptp(probe.tau[:, j]) and np.mean(x[:, 1:] * x[:, :1], axis=0).max() < BETTER:
+            yield finding(
+                "drive_off", name, joint, share=len(off) / moves[:, j].sum(), quoted=quoted(joint),
+                ratio=np.sqrt(tau[off, j].mean() / load[off, j].mean()),
+                severity="error" if is_all else "warning",
+            )  # fmt: skip
 
 
 def check_excitation(

@@ -11,11 +11,13 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.channels import (
     check_channels,
     check_clock,
+    check_limits,
     check_rest,
     check_torque_channels,
 )
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
+from robotid.robot.tree import Joint
 
 RATE, N = 500.0, 20000  # [Hz], rows of 40 s
 
@@ -102,6 +104,79 @@ def test_a_velocity_in_another_unit_is_told_with_its_factor(factor):
     (unused,) = found_of(scaled, "velocity_scale", velocity="differentiated")
     assert unused.severity == "note"
     assert found_of(log, "velocity_scale", velocity="auto") == []
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.985, 1.02, 1.5])
+def test_a_clock_is_one_finding_with_its_standard_error_and_names_no_velocity(factor):
+    log, rng = log_of_two(), np.random.default_rng(0)
+    v = log.v + 0.01 * rng.standard_normal(log.v.shape)  # 1 % noise
+    clocked = replace(log, t=log.t * factor, v=v)
+    (found,) = found_of(clocked, "time_scale", "velocity_scale")
+    assert (found.code, found.where, found.severity) == (
+        "time_scale", "run.csv", "error" if abs(factor - 1) > 0.1 else "warning"
+    )  # fmt: skip
+    figures = found.evidence
+    assert abs(figures["factor"] - factor) < max(4 * figures["std_error"], 1e-4)
+    assert figures["std_error"] < 2e-3
+    assert "correct the time stamps" in found.message
+    single = found_of(replace(clocked, v=v * [1.0, 2.0]), "time_scale", "velocity_scale")
+    wrong = [x for x, own in (("a", factor), ("b", 2 * factor)) if abs(own - 1) > 0.1]
+    assert [(f.code, *f.joints) for f in single] == [("velocity_scale", x) for x in wrong]
+
+
+def test_a_right_clock_and_velocities_that_share_a_unit_are_no_clock():
+    log = log_of_two()
+    late = np.column_stack([np.interp(log.t - 0.03, log.t, v) for v in log.v.T])
+    assert found_of(replace(log, v=late), "time_scale", "velocity_scale") == []
+    assert found_of(replace(log, t=1.005 * log.t), "time_scale", "velocity_scale") == []
+    (found,) = found_of(replace(log, v=9.5493 * log.v), "time_scale", "velocity_scale")
+    assert (found.code, found.joints) == ("velocity_scale", ("a", "b"))  # rpm
+
+
+def joint(**limits):
+    return Joint(**({"name": "a", "type": "revolute", "parent": "", "child": "a"} | limits))
+
+
+LIFT = joint(type="prismatic", lower=-0.2, upper=0.05, effort=50.0)
+
+
+@pytest.mark.parametrize(
+    ("size", "limits", "units"),
+    [
+        (1000.0, LIFT, "mm"), (100.0, LIFT, "cm"), (1.0, LIFT, None),
+        (5000.0, LIFT, ""),  # no unit
+        (180 / np.pi, joint(lower=-0.1, upper=0.1), "degrees"),
+        (1.0, joint(lower=-0.04, upper=0.04), None),  # a little beyond
+        (180 / np.pi, joint(lower=0.0, upper=0.0), None),  # no range
+    ],
+)  # fmt: skip
+def test_positions_far_beyond_the_limits_are_named_with_their_unit(size, limits, units):
+    log = log_of_two().select(["a"])
+    q = -0.08 + 0.09 * log.q  # from -0.17 to 0.01
+    found = list(check_limits(replace(log, q=size * q), [limits]))
+    assert [f.words["units"] for f in found] == [] if units is None else [units]
+    for finding in found:
+        assert (finding.code, finding.severity) == ("beyond_limits", "error")
+        setting = {"mm": "0.1", "cm": "1", "degrees": "1.745"}.get(units)
+        assert (f"percent = {{ a = [0, {setting}] }} ({units})" in finding.message) == bool(units)
+
+
+def test_torques_far_beyond_the_effort_limits_are_one_finding():
+    log = log_of_two()  # 20 and 5 N m
+    for efforts, names in (((50.0, 28.0), ("a", "b")), ((50.0, 1e6), ("a",)), ((0.0, 28.0), ("b",)),
+                           ((1.0, 1.0), ())):  # fmt: skip
+        limits = [joint(name=x, effort=e) for x, e in zip("ab", efforts, strict=True)]
+        found = list(check_limits(replace(log, tau=log.tau * 1000.0), limits))
+        assert [f.joints for f in found] == ([names] if names else [])
+        assert list(check_limits(log, limits)) == []
+    (found,) = check_limits(replace(log, tau=log.tau * 1000.0), [limits[0], joint(effort=28.0)])
+    assert found.evidence["times"] == pytest.approx(5000 / 28, rel=0.02)
+
+
+def test_torques_that_are_all_0_are_one_error():
+    (found,) = check_torque_channels(replace(log_of_two(), tau=np.zeros((N, 2))))
+    assert (found.code, found.severity, found.where) == ("constant_torque", "error", "run.csv")
+    assert "0 in every row of every joint" in found.message
 
 
 @pytest.mark.parametrize(("level", "names"), [(1.0, ()), (2.0, ("b",))])

@@ -153,6 +153,20 @@ def test_a_payload_is_weighed(ur5):
     assert abs(found.evidence["mass"] - 4.2) < 3 * found.evidence["std_error"]
 
 
+@pytest.mark.parametrize(("last", "severity"), [(1000, "error"), (300, "warning")])
+def test_a_drive_that_is_off_is_no_sign_of_its_torque(ur5, last, severity):
+    log, rng = clean_log(ur5, 0, duration=10.0), np.random.default_rng(0)
+    tau = log.tau.copy()
+    tau[:last, 1] = 0.05 * rng.standard_normal(len(tau[:last])) - 0.02 * log.v[:last, 1]
+    findings = diagnose(ur5, [replace(log, tau=tau)], [], SIGNALS)
+    (found,) = [f for f in findings if f.code == "drive_off"]
+    assert (found.where, found.severity) == ("run.csv: shoulder_lift_joint", severity)
+    assert found.evidence["share"] == pytest.approx(last / 1000, abs=0.1)
+    assert found.evidence["ratio"] < 0.02
+    if severity == "error":
+        assert {f.code for f in findings if f.joints == found.joints} == {"drive_off"}
+
+
 # ---- the recordings of other laboratories
 def whole(recordings, monkeypatch, name, *files):
     monkeypatch.setenv("ROBOTID_DATA", str(recordings))
@@ -181,6 +195,13 @@ def test_ur10e_carries_a_load_and_moves_one_joint_at_a_time(recordings, monkeypa
     still = {f.where.split(": ")[1] for f in single if f.code in ("static_joint", "hardly_moves")}
     assert "shoulder_lift_joint" not in still
     assert len(still) >= 4
+
+
+@pytest.mark.parametrize("file", ["log_143747", "log_144115"])
+def test_the_drive_of_a_recorded_pendulum_is_off(recordings, file):
+    folder = recordings / "pendulums" / "dfki_double_pendulum_C1"
+    job = Job(folder / "robot.urdf", identification=(LogEntry(folder / f"{file}.parquet"),))
+    assert [f.code for f in examine(job) if f.severity == "error"] == ["drive_off"]
 
 
 def test_motor_side_columns_are_refused_by_name(recordings, monkeypatch):
