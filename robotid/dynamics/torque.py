@@ -220,9 +220,7 @@ class TorqueSlopes(NamedTuple):
     by_a: Array  # by the accelerations, likewise: the mass matrix of the bodies
     by_gravity: Array  # by gravity, along the axes of the world, shape (N, n, 3)
     by_origin: Array  # by each joint's origin in the body before, (N, n, n, 3): torque, joint, axis
-    by_turn: (
-        Array  # by turning each joint about its origin, with its axis, along its axes, likewise
-    )
+    by_axis: Array  # by turning each joint about the two directions across its axis, (N, n, n, 2)
     by_force: Array  # by a force on the last body's tip, along the axes of the world, (N, n, 3)
 
 
@@ -450,16 +448,11 @@ def _torque_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -
     moved = twists[:, :3] + np.cross(twists[:, 3:], at[:, :, None], axis=1)  # the tip, (N, 3, n)
     carries = np.isin(range(1, plain.njoints), plain.supports[plain.njoints - 1])
     by_force = -moved.swapaxes(1, 2) * carries[:, None]
+    axes = {joint.name: joint.axis for joint in model.tree.joints}
+    across = np.stack([np.linalg.svd([axes[x]])[2][1:] for x in model.joints])  # (n, 2, 3)
+    by_axis = np.einsum("Nnjk,jik->Nnji", D[0][..., first + range(3, 6)], across)
     # gravity acts as an acceleration of the base in the opposite direction
-    return (
-        by_q,
-        by_v,
-        by_a,
-        -sum(falling),
-        by_origin,
-        D[0][..., first + range(3, 6)],
-        G.T @ by_force,
-    )
+    return by_q, by_v, by_a, -sum(falling), by_origin, by_axis, G.T @ by_force
 
 
 def _tip(model: pin.Model) -> Array:
@@ -532,11 +525,11 @@ def _drive_motion(model: RobotModel, trajectory: Trajectory, has_rate: bool) -> 
         return motion
     if layout.remembering:
         m = m.with_states(remembered(layout, motion))
-    rate = _rate(load + drive_torque(model, model.carried_by, m), m)
+    rate = torque_rate(load + drive_torque(model, model.carried_by, m), m)
     return drive_motion(layout, m.q, m.v, m.a, signs, load, rate, begins)
 
 
-def _rate(torque: Array, motion: Trajectory) -> Array:
+def torque_rate(torque: Array, motion: Trajectory) -> Array:
     """Return the change of torques within each segment, shape (N, n) [N m/s, N/s]."""
     rate = np.zeros_like(torque)
     edges = np.flatnonzero(np.diff(motion.segment)) + 1

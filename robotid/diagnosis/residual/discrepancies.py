@@ -1,4 +1,4 @@
-"""Readings of recordings and the URDF: offsets, scales, a clock, gravity, origins of joints.
+"""Readings of recordings and the URDF: offsets, scales, clocks, gravity, forces, joints' places.
 
 Other masses cannot imitate any of these: each changes the predicted torque tau(q, v, a) in its own
 way. To first order, in all joints together,
@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from scipy.interpolate import BSpline
 
 from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
@@ -22,12 +23,21 @@ from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.residual.misfit import Misfit, find_misfits
 from robotid.diagnosis.residual.term_trials import Accepted, Sample, Trials, along
-from robotid.dynamics.torque import body_slopes, drive_torque, inverse_dynamics
+from robotid.dynamics.torque import (
+    TorqueSlopes,
+    body_slopes,
+    drive_torque,
+    inverse_dynamics,
+    is_loaded,
+    torque_rate,
+)
 from robotid.estimation.fitting.fitted import Fit
-from robotid.robot.model import RobotModel
+from robotid.robot.model import GRAVITY, RobotModel
 
 _STEP = 1e-5  # step of a finite difference [-, rad or m]
 _STEPS = 5  # Gauss-Newton steps of a size
+_SPLINES = 40  # largest number of B-splines in time ...
+_BLOCKS = 3  # ... and blocks that are held out, of one of them
 _Altered = tuple[RobotModel, Sequence[Trajectory]]
 
 
@@ -42,6 +52,7 @@ class Reading:
     columns: Callable[[Array], Array]
     #: Robot and motions with sizes (c,), where torques are nonlinear in them.
     applied: Callable[[Array, Array], _Altered] | None = None
+    changes: bool = False  # whether its sizes change in time
 
 
 def readings(model: RobotModel, pi: Array, sample: Sample) -> tuple[Reading, ...]:
@@ -52,32 +63,39 @@ def readings(model: RobotModel, pi: Array, sample: Sample) -> tuple[Reading, ...
     still = [replace(m, v=0.0 * m.v, a=0.0 * m.a) for m in at]
     inertial = tau - of_drives - _torques(model, bodies, still)
     of_motions = [body_slopes(model, pi, motion) for motion in at]
-    *by_motion, by_gravity, by_origin = map(np.concatenate, zip(*of_motions, strict=True))
+    by = TorqueSlopes(*map(np.concatenate, zip(*of_motions, strict=True)))
+    of_bodies = (by.by_q, by.by_v, by.by_a)
+    by_motion = [D + _drive_slopes(model, pi, at, x) for D, x in zip(of_bodies, "qva", strict=True)]
     q, v, a = (np.concatenate([getattr(m, key) for m in at]) for key in "qva")
+    jerk = np.concatenate([
+        torque_rate(x.trajectory.a, x.trajectory)[rows]
+        for x, rows in zip(sample.recordings, sample.taken, strict=True)
+    ])  # fmt: skip
     direction = np.column_stack([motion.direction for motion in sample.motions])
     down = np.array(model.pin_model.gravity.linear)
-    across = np.linalg.norm(down) * np.linalg.svd(down[None])[2][1:]  # (2, 3)
+    len_g = float(np.linalg.norm(down))
+    across = len_g * np.linalg.svd(down[None])[2][1:]  # (2, 3)
+
+    def changed(*motion: Array) -> Array:
+        """Return the change of the torques with that of positions, velocities, accelerations."""
+        parts = zip(by_motion, motion, strict=True)
+        return np.asarray(sum(D @ x[..., None] for D, x in parts))
 
     def moved(scale: Array, shift: Array) -> Array:
         """Return the derivative of the torques for positions (1 + e scale) q + e shift by e."""
-        factor = 1.0 + _STEP * scale
-        change = [
-            replace(m, q=factor * m.q + _STEP * shift, v=factor * m.v, a=factor * m.a) for m in at
-        ]
-        Z: Array = (_drives(model, pi, change) - of_drives)[..., None] / _STEP
-        for D, x in zip(by_motion, (scale * q + shift, scale * v, scale * a), strict=True):
-            Z += D @ x[..., None]
-        return Z
+        return changed(scale * q + shift, scale * v, scale * a)
 
     def offset(on: Array, x: Array) -> _Altered:
         return model, [replace(m, q=m.q + x * on) for m in at]
 
     def tilted(on: Array, x: Array) -> _Altered:
         g = down + x @ across  # by angles with these tangents
-        return model.with_gravity(g * np.linalg.norm(down) / np.linalg.norm(g)), at
+        return model.with_gravity(g * len_g / np.linalg.norm(g)), at
 
+    late = -changed(v, a, jerk)  # (N, n, 1)
     one, every = [(joint,) for joint in joints], [tuple[str, ...]()]
     level = every if down.any() else []
+    weight = pi[: model.layout.n_inertial : 10].sum() * np.linalg.norm(GRAVITY)
     driven = [(joint,) for joint, size in zip(joints, sample.torque, strict=True) if size]
     wrists = [joints[first:] for first in range(1, n - 1)]  # whose drives are of the same type
     return (
@@ -89,12 +107,31 @@ def readings(model: RobotModel, pi: Array, sample: Sample) -> tuple[Reading, ...
         Reading("angle_scale", 0.02, one + every, lambda on: moved(on, 0 * on)),
         Reading("torque_scale", 0.05, driven + wrists, lambda on: (tau * on)[..., None]),
         Reading("time_scale", 0.04, every, lambda on: inertial[..., None]),
-        Reading("gravity", 0.05, level, lambda on: by_gravity @ across.T, tilted),
+        Reading("joint_delay", 0.003, one, lambda on: late * on[:, None]),
+        Reading("gravity", 0.025, level, lambda on: by.by_gravity @ across.T, tilted),
+        Reading("moving_gravity", 0.025, level, lambda on: by.by_gravity * len_g, changes=True),
+        Reading("external_force", 0.02 * weight, every, lambda on: by.by_force),
+        Reading("external_force", 0.02 * weight, every, lambda on: by.by_force, changes=True),
         Reading(
             "joint_origin", 0.01, one + every,
-            lambda on: by_origin[:, :, on > 0].reshape(*tau.shape, -1),
+            lambda on: by.by_origin[:, :, on > 0].reshape(*tau.shape, -1),
+        ),
+        Reading(
+            "axis_direction", 0.03, one,
+            lambda on: by.by_axis[:, :, on > 0].reshape(*tau.shape, -1),
         ),
     )  # fmt: skip
+
+
+def _drive_slopes(model: RobotModel, pi: Array, at: Sequence[Trajectory], key: str) -> Array:
+    """Return the derivatives of the drives' torques by q, v or a of each joint, (N, n, n)."""
+    # Drives of their own joints only: all joints are moved together.
+    every, before = np.eye(len(model.joints)), _drives(model, pi, at)
+    is_plain = np.array_equal(model.layout.drive_ratios, every) and not is_loaded(model)
+    moves = every.sum(axis=0, keepdims=True) if is_plain else every
+    ends = [[replace(m, **{key: getattr(m, key) + _STEP * on}) for m in at] for on in moves]
+    D = np.stack([(_drives(model, pi, end) - before) / _STEP for end in ends], axis=2)
+    return D * every if is_plain else D
 
 
 def _torques(model: RobotModel, pi: Array, at: Sequence[Trajectory]) -> Array:
@@ -129,6 +166,7 @@ class _Alteration:
             "torque_scale": {"factor": 1 + x[0], "what": sense, "cure": sense},
             "time_scale": {"factor": 1 + x[0], "speed": np.sqrt(max(1 + x[0], 0.0))},
             "joint_origin": {"named": joint or "a joint"},
+            "external_force": {"what": "constant", "cure": "constant"},
         }
         more, applied = values.get(self.reading.code, {}), self.reading.applied
         if applied is not None:
@@ -148,8 +186,12 @@ def explain_residual(
     model = fit.model
     if sample is None or model.free_flyer or model.constraints or model.passive:
         return (), ()
+    every = alterations(model, fit.standard, sample)
+    possible = {one: Z for one, Z in every.items() if not one.reading.changes}
+    changing = tuple(_changing(sample, every))
+    if changing:  # it imitates all other readings and terms
+        return (), changing
     misfits = find_misfits(sample)
-    possible = alterations(model, fit.standard, sample)
     altered_by = list(_accepted(fit, sample, possible))
     if misfits and altered_by:
         altered = np.concatenate([possible[alteration] for alteration, *_ in altered_by], axis=2)
@@ -189,15 +231,47 @@ def alterations(model: RobotModel, pi: Array, sample: Sample) -> dict[_Alteratio
     return columns
 
 
+def _complexity(columns: Mapping[_Alteration, Sequence[int]], one: _Alteration) -> tuple[int, int]:
+    return len(columns[one]), len(one.joints)  # number of sizes, and of joints named
+
+
+def _changing(sample: Sample, possible: Mapping[_Alteration, Array]) -> Iterator[Finding]:
+    """Yield gravity or a force that changes in time and explains most of a large residual."""
+    # Segments do not predict others: blocks shorter than a spline are held out. Three directions
+    # explain the torques of three joints by themselves.
+    error = float(np.sqrt(np.max(np.sum(sample.r[: sample.rows] ** 2, axis=0) / sample.torque)))
+    count = min(_SPLINES, sample.rows // (_BLOCKS * decisions.SHORTEST))
+    rows = count * _BLOCKS * decisions.SHORTEST
+    if len(sample.joints) <= 3 or error < decisions.DIFFERS or count < decisions.SCATTERED:
+        return
+    folded, order = sample.in_blocks(rows, decisions.SHORTEST)
+    knots = np.pad(np.linspace(0.0, rows, count - 1), 2, "edge")
+    B = BSpline.design_matrix(order, knots, 2).toarray()  # (rows, count), quadratic
+    trials, offered = Trials.of(folded, {
+        one: (Z[order, ..., None] * B[:, None, None]).reshape(rows, len(sample.joints), -1)
+        if one.reading.changes else Z[order]
+        for one, Z in possible.items()
+    })  # fmt: skip
+    complexity = partial(_complexity, offered)
+    best = next(trials.accepted(offered, decisions.ALTERATION, complexity), None)
+    if best is None or not best.option.reading.changes or best.p_value > decisions.P_VALUE:
+        return
+    x = B @ best.theta.reshape(-1, count).T  # (rows, 3)
+    size, variance = float(np.sqrt(np.mean(np.sum(x**2, axis=1)))), np.trace(best.covariance)
+    if 100 * best.share >= decisions.MAIN and size >= best.option.reading.least:
+        yield finding(
+            best.option.reading.code, subject="all joints", severity="error", what="changes",
+            cure="changes", explained=False, size=size, std_error=np.sqrt(variance / count),
+            angle=np.degrees(np.arctan(size)), share_pct=100 * best.share, error_pct=100 * error,
+        )  # fmt: skip
+
+
 def _accepted(
     fit: Fit, sample: Sample, possible: Mapping[_Alteration, Array]
 ) -> Iterator[tuple[_Alteration, Finding, Sample]]:
     """Yield the alterations that explain the residual, findings, and the corrected samples."""
     trials, offered = Trials.of(sample, possible)
-
-    def complexity(one: _Alteration) -> tuple[int, int]:
-        return len(offered[one]), len(one.joints)  # number of sizes, and of joints named
-
+    complexity = partial(_complexity, offered)
     for accepted in trials.accepted(offered, decisions.ALTERATION, complexity):
         best, size, error = accepted.option, accepted.theta, np.sqrt(np.diag(accepted.covariance))
         least = best.reading.least * _needed(accepted)
