@@ -221,7 +221,6 @@ class TorqueSlopes(NamedTuple):
     by_gravity: Array  # by gravity, along the axes of the world, shape (N, n, 3)
     by_origin: Array  # by each joint's origin in the body before, (N, n, n, 3): torque, joint, axis
     by_axis: Array  # by turning each joint about the two directions across its axis, (N, n, n, 2)
-    by_force: Array  # by a force on the last body's tip, along the axes of the world, (N, n, 3)
 
 
 def predict(
@@ -356,6 +355,18 @@ def body_slopes(model: RobotModel, pi: Array, trajectory: Trajectory) -> TorqueS
     return TorqueSlopes(*_of_consistent(_torque_slopes, model, pi, *state))
 
 
+def force_slopes(model: RobotModel, trajectory: Trajectory) -> Array:
+    """Return the derivatives of the torques by a force (3,) on the last body's tip, (N, n, 3)."""
+    engine, G = model.pin_model, model.velocity_map
+    own = [k for k, frame in enumerate(engine.frames) if frame.parentJoint == engine.njoints - 1]
+    tip = max(own, key=lambda k: np.linalg.norm(engine.frames[k].placement.translation))
+    slopes, data = np.empty((len(trajectory.q), len(G), 3)), engine.createData()
+    for D, q in zip(slopes, model.configurations(trajectory.q), strict=True):
+        J = pin.computeFrameJacobian(engine, data, q, tip, pin.LOCAL_WORLD_ALIGNED)
+        D[:] = -J[:3].T
+    return np.asarray(G.T @ slopes)
+
+
 def body_slopes_by_position(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
     """Return ``body_slopes`` by the positions alone, (N, n, n), several times as fast."""
     return _of_consistent(_position_slopes, model, pi, trajectory.q, trajectory.v, trajectory.a)[0]
@@ -427,16 +438,13 @@ def _torque_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -
     velocities, accelerations = np.zeros((2, len(v), extended.nv))
     velocities[:, own], accelerations[:, own] = v @ G.T, a @ G.T
     slopes = np.empty((3, len(q), len(own), extended.nv))
-    twists, at, tip = np.empty((len(q), 6, len(own))), np.empty((len(q), 3)), _tip(plain)
     derive, data = pin.computeRNEADerivatives, extended.createData()
     states = zip(configurations, velocities, accelerations, strict=True)
-    for D_q, D_v, D_a, J, p, state in zip(*slopes, twists, at, states, strict=True):
+    for D_q, D_v, D_a, state in zip(*slopes, states, strict=True):
         by_q, by_v, by_a = derive(extended, data, *state)
         by_q.take(own, 0, D_q, "clip")  # without bound checks
         by_v.take(own, 0, D_v, "clip")
         by_a.take(own, 0, D_a, "clip")
-        data.J.take(own, 1, J, "clip")
-        p[:] = data.oMi[joints[-1]].act(tip)
     D: Array = G.T @ slopes  # tau = G^T tau_pinocchio
     by_q, by_v, by_a = D[..., own] @ G
     leaders = np.array([plain.getJointId(name) - 1 for name in model.joints])
@@ -445,20 +453,11 @@ def _torque_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -
     by_origin = np.einsum("Nnjk,jik->Nnji", D[0][..., first + range(3)], rotations[leaders])
     roots = [i for i in range(len(before)) if plain.parents[i + 1] == 0]
     falling = [D[2][..., before[i] + np.arange(3)] @ rotations[i].T for i in roots]
-    moved = twists[:, :3] + np.cross(twists[:, 3:], at[:, :, None], axis=1)  # the tip, (N, 3, n)
-    carries = np.isin(range(1, plain.njoints), plain.supports[plain.njoints - 1])
-    by_force = -moved.swapaxes(1, 2) * carries[:, None]
     axes = {joint.name: joint.axis for joint in model.tree.joints}
     across = np.stack([np.linalg.svd([axes[x]])[2][1:] for x in model.joints])  # (n, 2, 3)
     by_axis = np.einsum("Nnjk,jik->Nnji", D[0][..., first + range(3, 6)], across)
     # gravity acts as an acceleration of the base in the opposite direction
-    return by_q, by_v, by_a, -sum(falling), by_origin, by_axis, G.T @ by_force
-
-
-def _tip(model: pin.Model) -> Array:
-    """Return the farthest frame of the last body from its joint, (3,) [m]."""
-    places = [x.placement.translation for x in model.frames if x.parentJoint == model.njoints - 1]
-    return np.asarray(max(places, key=np.linalg.norm, default=np.zeros(3)))
+    return by_q, by_v, by_a, -sum(falling), by_origin, by_axis
 
 
 def _with_movable_origins(model: pin.Model) -> tuple[pin.Model, list[int]]:

@@ -27,6 +27,7 @@ from robotid.dynamics.torque import (
     TorqueSlopes,
     body_slopes,
     drive_torque,
+    force_slopes,
     inverse_dynamics,
     is_loaded,
     torque_rate,
@@ -57,24 +58,24 @@ class Reading:
 
 def readings(model: RobotModel, pi: Array, sample: Sample) -> tuple[Reading, ...]:
     """Return the readings that are tried, an entry each."""
-    n, joints, at = len(model.joints), model.joints, sample.at
-    tau, of_drives = _torques(model, pi, at), _drives(model, pi, at)
-    bodies = np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
-    still = [replace(m, v=0.0 * m.v, a=0.0 * m.a) for m in at]
-    inertial = tau - of_drives - _torques(model, bodies, still)
-    of_motions = [body_slopes(model, pi, motion) for motion in at]
+    of_motions = [body_slopes(model, pi, motion) for motion in sample.at]
     by = TorqueSlopes(*map(np.concatenate, zip(*of_motions, strict=True)))
+    return *_of_recordings(model, pi, sample, by), *_of_robot(model, pi, sample, by)
+
+
+def _of_recordings(
+    model: RobotModel, pi: Array, sample: Sample, by: TorqueSlopes
+) -> tuple[Reading, ...]:
+    """Return the readings of positions, torques and time."""
+    joints, at = model.joints, sample.at
+    tau, of_drives = _torques(model, pi, at), _drives(model, pi, at)
+    inertial = tau - of_drives - _torques(model, _bodies(model, pi), _still(at))
     of_bodies = (by.by_q, by.by_v, by.by_a)
     by_motion = [D + _drive_slopes(model, pi, at, x) for D, x in zip(of_bodies, "qva", strict=True)]
     q, v, a = (np.concatenate([getattr(m, key) for m in at]) for key in "qva")
-    jerk = np.concatenate([
-        torque_rate(x.trajectory.a, x.trajectory)[rows]
-        for x, rows in zip(sample.recordings, sample.taken, strict=True)
-    ])  # fmt: skip
+    recorded = zip(sample.recordings, sample.taken, strict=True)
+    jerk = np.concatenate([torque_rate(x.trajectory.a, x.trajectory)[k] for x, k in recorded])
     direction = np.column_stack([motion.direction for motion in sample.motions])
-    down = np.array(model.pin_model.gravity.linear)
-    len_g = float(np.linalg.norm(down))
-    across = len_g * np.linalg.svd(down[None])[2][1:]  # (2, 3)
 
     def changed(*motion: Array) -> Array:
         """Return the change of the torques with that of positions, velocities, accelerations."""
@@ -88,16 +89,10 @@ def readings(model: RobotModel, pi: Array, sample: Sample) -> tuple[Reading, ...
     def offset(on: Array, x: Array) -> _Altered:
         return model, [replace(m, q=m.q + x * on) for m in at]
 
-    def tilted(on: Array, x: Array) -> _Altered:
-        g = down + x @ across  # by angles with these tangents
-        return model.with_gravity(g * len_g / np.linalg.norm(g)), at
-
     late = -changed(v, a, jerk)  # (N, n, 1)
     one, every = [(joint,) for joint in joints], [tuple[str, ...]()]
-    level = every if down.any() else []
-    weight = pi[: model.layout.n_inertial : 10].sum() * np.linalg.norm(GRAVITY)
     driven = [(joint,) for joint, size in zip(joints, sample.torque, strict=True) if size]
-    wrists = [joints[first:] for first in range(1, n - 1)]  # whose drives are of the same type
+    wrists = [joints[first:] for first in range(1, len(joints) - 1)]  # with drives of one type
     return (
         Reading("position_offset", 0.01, one, lambda on: moved(0 * on, on), offset),
         Reading(
@@ -108,19 +103,55 @@ def readings(model: RobotModel, pi: Array, sample: Sample) -> tuple[Reading, ...
         Reading("torque_scale", 0.05, driven + wrists, lambda on: (tau * on)[..., None]),
         Reading("time_scale", 0.04, every, lambda on: inertial[..., None]),
         Reading("joint_delay", 0.003, one, lambda on: late * on[:, None]),
-        Reading("gravity", 0.025, level, lambda on: by.by_gravity @ across.T, tilted),
-        Reading("moving_gravity", 0.025, level, lambda on: by.by_gravity * len_g, changes=True),
-        Reading("external_force", 0.02 * weight, every, lambda on: by.by_force),
-        Reading("external_force", 0.02 * weight, every, lambda on: by.by_force, changes=True),
-        Reading(
-            "joint_origin", 0.01, one + every,
-            lambda on: by.by_origin[:, :, on > 0].reshape(*tau.shape, -1),
-        ),
-        Reading(
-            "axis_direction", 0.03, one,
-            lambda on: by.by_axis[:, :, on > 0].reshape(*tau.shape, -1),
-        ),
     )  # fmt: skip
+
+
+def _of_robot(
+    model: RobotModel, pi: Array, sample: Sample, by: TorqueSlopes
+) -> tuple[Reading, ...]:
+    """Return the readings of gravity, forces and the places of joints."""
+    at, shape = sample.at, (len(by.by_q), len(model.joints), -1)
+    down = np.array(model.pin_model.gravity.linear)
+    g = float(np.linalg.norm(down))
+    across = g * np.linalg.svd(down[None])[2][1:]  # (2, 3)
+
+    def tilted(on: Array, x: Array) -> _Altered:
+        other = down + x @ across  # by angles with these tangents
+        return model.with_gravity(other * g / np.linalg.norm(other)), at
+
+    def weighed(on: Array) -> Array:
+        # of the URDF's masses: those of the fit may have adapted to a base that moves
+        bodies, still = _bodies(model, model.standard_parameters()), _still(at)
+        pulled = [_torques(model.with_gravity(axis), bodies, still) for axis in g * np.eye(3)]
+        return np.stack(pulled, axis=2)
+
+    def push(on: Array) -> Array:
+        return np.concatenate([force_slopes(model, motion) for motion in at])
+
+    one, every = [(joint,) for joint in model.joints], [tuple[str, ...]()]
+    level = every if down.any() else []
+    least = 0.02 * float(np.linalg.norm(GRAVITY)) * pi[: model.layout.n_inertial : 10].sum()
+    return (
+        Reading("gravity", 0.025, level, lambda on: by.by_gravity @ across.T, tilted),
+        Reading("moving_gravity", 0.025, level, lambda on: g * by.by_gravity, changes=True),
+        Reading("moving_gravity", 0.025, level, weighed, changes=True),
+        Reading("external_force", least, every, push),
+        Reading("external_force", least, every, push, changes=True),
+        Reading(
+            "joint_origin", 0.01, one + every, lambda on: by.by_origin[:, :, on > 0].reshape(shape)
+        ),
+        Reading("axis_direction", 0.03, one, lambda on: by.by_axis[:, :, on > 0].reshape(shape)),
+    )  # fmt: skip
+
+
+def _still(at: Sequence[Trajectory]) -> list[Trajectory]:
+    """Return motions at rest."""
+    return [replace(m, v=0.0 * m.v, a=0.0 * m.a) for m in at]
+
+
+def _bodies(model: RobotModel, pi: Array) -> Array:
+    """Return standard parameters without drives, shape (p,)."""
+    return np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
 
 
 def _drive_slopes(model: RobotModel, pi: Array, at: Sequence[Trajectory], key: str) -> Array:
@@ -186,9 +217,10 @@ def explain_residual(
     model = fit.model
     if sample is None or model.free_flyer or model.constraints or model.passive:
         return (), ()
-    every = alterations(model, fit.standard, sample)
-    possible = {one: Z for one, Z in every.items() if not one.reading.changes}
-    changing = tuple(_changing(sample, every))
+    table = readings(model, fit.standard, sample)
+    possible = alterations(model, [reading for reading in table if not reading.changes])
+    in_time = [reading for reading in table if reading.changes]
+    changing = tuple(_changing(model, sample, in_time, possible))
     if changing:  # it imitates all other readings and terms
         return (), changing
     misfits = find_misfits(sample)
@@ -221,48 +253,52 @@ def _left(sample: Sample, Z: Array) -> float:
     return float(left[: sample.fitted].sum())
 
 
-def alterations(model: RobotModel, pi: Array, sample: Sample) -> dict[_Alteration, Array]:
+def alterations(model: RobotModel, table: Sequence[Reading]) -> dict[_Alteration, Array]:
     """Return each reading for each of its groups of joints, and its columns (N, n, c)."""
     columns = {}
-    for reading in readings(model, pi, sample):
+    for reading in table:
         for joints in reading.groups:
             on = np.isin(model.joints, joints or model.joints).astype(float)
             columns[_Alteration(reading, joints, on)] = reading.columns(on)
     return columns
 
 
-def _complexity(columns: Mapping[_Alteration, Sequence[int]], one: _Alteration) -> tuple[int, int]:
-    return len(columns[one]), len(one.joints)  # number of sizes, and of joints named
-
-
-def _changing(sample: Sample, possible: Mapping[_Alteration, Array]) -> Iterator[Finding]:
+def _changing(
+    model: RobotModel, sample: Sample, in_time: Sequence[Reading],
+    constant: Mapping[_Alteration, Array],
+) -> Iterator[Finding]:  # fmt: skip
     """Yield gravity or a force that changes in time and explains most of a large residual."""
     # Segments do not predict others: blocks shorter than a spline are held out. Three directions
     # explain the torques of three joints by themselves.
-    error = float(np.sqrt(np.max(np.sum(sample.r[: sample.rows] ** 2, axis=0) / sample.torque)))
+    n = len(sample.joints)
+    squares, driven = np.sum(sample.r[: sample.rows] ** 2, axis=0), sample.torque > 0
+    error = float(np.sqrt(np.max(squares[driven] / sample.torque[driven], initial=0.0)))
     count = min(_SPLINES, sample.rows // (_BLOCKS * decisions.SHORTEST))
     rows = count * _BLOCKS * decisions.SHORTEST
-    if len(sample.joints) <= 3 or error < decisions.DIFFERS or count < decisions.SCATTERED:
+    if n <= 3 or error < decisions.DIFFERS or count < decisions.SCATTERED:
         return
     folded, order = sample.in_blocks(rows, decisions.SHORTEST)
     knots = np.pad(np.linspace(0.0, rows, count - 1), 2, "edge")
     B = BSpline.design_matrix(order, knots, 2).toarray()  # (rows, count), quadratic
-    trials, offered = Trials.of(folded, {
-        one: (Z[order, ..., None] * B[:, None, None]).reshape(rows, len(sample.joints), -1)
-        if one.reading.changes else Z[order]
-        for one, Z in possible.items()
-    })  # fmt: skip
-    complexity = partial(_complexity, offered)
-    best = next(trials.accepted(offered, decisions.ALTERATION, complexity), None)
-    if best is None or not best.option.reading.changes or best.p_value > decisions.P_VALUE:
+    changing = alterations(model, in_time)
+    splines = {
+        (one, True): (Z[order, ..., None] * B[:, None, None]).reshape(rows, n, -1)
+        for one, Z in changing.items()
+    }
+    plain = {(one, False): Z[order] for one, Z in {**changing, **constant}.items()}
+    trials, offered = Trials.of(folded, splines | plain)
+    best = next(trials.accepted(offered, decisions.ALTERATION, lambda x: len(offered[x])), None)
+    if best is None or not best.option[1] or best.p_value > decisions.P_VALUE:
         return
+    reading, share = best.option[0].reading, 100 * best.share
     x = B @ best.theta.reshape(-1, count).T  # (rows, 3)
-    size, variance = float(np.sqrt(np.mean(np.sum(x**2, axis=1)))), np.trace(best.covariance)
-    if 100 * best.share >= decisions.MAIN and size >= best.option.reading.least:
+    mean, variance = float(np.linalg.norm(x.mean(axis=0))), np.trace(best.covariance)
+    size = float(np.linalg.norm(np.std(x, axis=0)))
+    if share >= decisions.MAIN and size >= max(reading.least, mean):
         yield finding(
-            best.option.reading.code, subject="all joints", severity="error", what="changes",
-            cure="changes", explained=False, size=size, std_error=np.sqrt(variance / count),
-            angle=np.degrees(np.arctan(size)), share_pct=100 * best.share, error_pct=100 * error,
+            reading.code, subject="all joints", severity="error", what="changes", cure="changes",
+            explained=False, size=size, std_error=np.sqrt(variance / count), share_pct=share,
+            angle=np.degrees(np.arctan(size)), error_pct=100 * error,
         )  # fmt: skip
 
 
@@ -271,7 +307,10 @@ def _accepted(
 ) -> Iterator[tuple[_Alteration, Finding, Sample]]:
     """Yield the alterations that explain the residual, findings, and the corrected samples."""
     trials, offered = Trials.of(sample, possible)
-    complexity = partial(_complexity, offered)
+
+    def complexity(one: _Alteration) -> tuple[int, int]:
+        return len(offered[one]), len(one.joints)  # number of sizes, and of joints named
+
     for accepted in trials.accepted(offered, decisions.ALTERATION, complexity):
         best, size, error = accepted.option, accepted.theta, np.sqrt(np.diag(accepted.covariance))
         least = best.reading.least * _needed(accepted)

@@ -312,8 +312,13 @@ def settled(before: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Findin
         terms.append(term)
     # torques in another unit bind the bodies to a wrong prior, whose error looks like a term
     rescaled = {joint for f in rest if f.code == "current_for_torque" for joint in f.joints}
-    of_drives = [f for f in terms if f.code in codes_with("term") and rescaled.issuperset(f.joints)]
-    return rest + [f.reworded(severity="note") if f in of_drives else f for f in terms]
+    delayed = any(f.code == "torque_delay" for f in rest)
+    explained = [
+        f for f in terms
+        if (f.code in codes_with("term") and rescaled.issuperset(f.joints))
+        or (f.code == "joint_delay" and delayed)
+    ]  # fmt: skip
+    return rest + [f.reworded(severity="note") if f in explained else f for f in terms]
 
 
 def _explains(term: Finding, hypothesis: Finding) -> bool:
