@@ -42,12 +42,12 @@ FILES = ("fleet.parquet", "fleet.json", "fleet.html")
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="6 units with 2 logs")
+    parser.add_argument("--quick", action="store_true", help="4 units with 2 logs")
     parser.add_argument("--units", type=int, default=1000)
     parser.add_argument("--logs", type=int, default=10)
     parser.add_argument("--once", action="store_true", help="the killed run alone")
     options = parser.parse_args()
-    units, logs = (6, 2) if options.quick else (options.units, options.logs)
+    units, logs = (4, 2) if options.quick else (options.units, options.logs)
     with tempfile.TemporaryDirectory() as where:
         folder = Path(where)
         start = time.perf_counter()

@@ -85,8 +85,8 @@ def main():
     warm_up(3, 3) if options.quick else warm_up(110, 25)
     unlike(1 if options.quick else 20)
     print("| arms in MuJoCo | sets | named | another | none |\n|---|---|---|---|---|")
-    alike_logs(7 if options.quick else 150)
-    alike_fleets(6 if options.quick else 150)
+    alike_logs(6 if options.quick else 150)
+    alike_fleets(5 if options.quick else 150)
     if not options.quick:
         odd_fleets(20)
 

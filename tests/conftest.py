@@ -1,3 +1,4 @@
+import fcntl
 import gc
 import os
 import sys
@@ -15,6 +16,7 @@ import pytest
 from helpers.browsing import launch
 from helpers.paths import IN_CI, ROOT
 from helpers.synthetic import exact_log, truth
+from numba.core.event import Listener, register
 
 from robotid.cli.identify import identify
 from robotid.data.files.read import read_log, write_log
@@ -38,11 +40,45 @@ def pytest_make_collect_report(collector):
     return report
 
 
+#: What takes longest begins first: of the first two files, one compiles and the other does not.
+LONGEST = (
+    "dynamics/test_compiled.py diagnosis/logs/test_example_robots.py "
+    "dynamics/simulation/test_loops.py identification/test_floating_base.py "
+    "identification/test_long_recordings.py cli/test_real_recordings.py cli/test_five_minutes.py "
+    "identification/closed_loop/test_limits.py figures/test_loops.py figures/test_motions.py "
+    "estimation/variation/test_spread.py cli/test_long_work.py test_docs.py test_hostile_inputs.py"
+)
+
+
+def pytest_configure(config):
+    config.option.loadscopereorder = False  # by number of tests, as pytest-xdist would
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
     """Give all workers one order of files."""
+    ranks = {ROOT / "tests" / name: rank for rank, name in enumerate(LONGEST.split())}
     if WORKER:
-        items.sort(key=lambda item: str(item.path))
+        items.sort(key=lambda item: (ranks.get(item.path, len(ranks)), str(item.path)))
+
+
+class TakeTurns(Listener):
+    """Let one worker at a time compile by Numba: the others find in the cache what it compiled."""
+
+    lock, depth = os.open(__file__, os.O_RDONLY), 0
+
+    def on_start(self, event):
+        self.depth += 1
+        fcntl.flock(self.lock, fcntl.LOCK_EX)
+
+    def on_end(self, event):
+        self.depth -= 1
+        if not self.depth:
+            fcntl.flock(self.lock, fcntl.LOCK_UN)
+
+
+if WORKER:
+    register("numba:compiler_lock", TakeTurns())
 
 
 def pytest_collection_finish():

@@ -222,6 +222,10 @@ def test_what_is_typed_keeps_one_value_unless_the_values_are_far_apart():
     assert message.startswith("c, a, b: the torque lags the position by 19.9 to 20.1 +- 1.0 ms")
     assert "torque_delay = 0.0200 (--torque-delay 0.0200)" in message
     (cause,) = grouped([late("a", 0.02), late("b", 0.03)])
+    of_joints = [("a", "x", 1.0), ("b", "y", 2.0), ("c", "x", 1.0)]  # far apart, but not those of x
+    found = [Finding("k", "note", joint, "", {"n": n}, log, (joint,), fault="{n!t:.1f}")
+             for log, joint, n in of_joints]  # fmt: skip
+    assert grouped(found)[0].messages == ("a, c: 1.0", "b: 2.0")
     assert [m.partition(" +-")[0] for m in cause.messages] == [
         "a: the torque lags the position by 20.0", "b: the torque lags the position by 30.0",
     ]  # fmt: skip

@@ -227,7 +227,6 @@ def test_a_path_that_no_file_system_takes_is_refused(model, log, path):
         (0.0, [0, 0, 0], [0], r"q, tau have shapes \(3,\), \(1,\), wanted \(2,\) each"),
         (0.0, [0, 0], [0, 0, 0], r"q, tau have shapes \(2,\), \(3,\), wanted \(2,\) each"),
         (0.0, [0, 0], ["x", 0], "tau is not an array of real numbers"),
-        (0.0, [0, 0], [np.nan, 0], "is not finite, so it was refused"),
     ],
 )
 def test_a_sample_that_is_none_changes_nothing(model, t, q, tau, words):

@@ -337,7 +337,9 @@ def body_points(model: RobotModel, *, with_visual: bool = False) -> dict[str, Ar
     clouds, unread = link_clouds(model)
     seen = {link for link, *_ in clouds}
     if with_visual:
-        clouds += [cloud for cloud in link_clouds(model, ("visual",))[0] if cloud[0] in seen]
+        visual, unseen = link_clouds(model, ("visual",))
+        clouds += [cloud for cloud in visual if cloud[0] in seen]
+        unread += unseen
     points = {k: [x for _, body, x in clouds if body == k] for _, k, _ in clouds}
     for place in link_places(model):
         if place.link in unread or (place.link not in seen and place.parameters.any()):

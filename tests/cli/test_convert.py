@@ -99,9 +99,11 @@ def test_the_command_refuses_by_name_and_leaves_what_was_there(tmp_path, bag, ca
     write_text("precious", target)
     assert main(["convert", str(bag), str(target)]) == 1
     assert f"bag has 2 topics of {JOINT_STATE}: /arm, /other" in capsys.readouterr().err
+    words = [str(bag), str(tmp_path / "one.csv"), "--joints", "elbow", "--topic", "/arm"]
+    assert main(["convert", *words]) == 0
     assert main(["convert", str(bag), str(target), "--topic", "/arm", "--effort", "x"]) == 2
     assert "log: effort is 'x', wanted one of" in capsys.readouterr().err
     assert main(["convert", str(bag), str(tmp_path / "run.mcap"), "--topic", "/arm"]) == 1
     assert "run.mcap: logs are written as .csv, " in capsys.readouterr().err
     assert target.read_text() == "precious"
-    assert {path.name for path in tmp_path.iterdir()} == {"bag", "run.csv"}
+    assert {path.name for path in tmp_path.iterdir()} == {"bag", "one.csv", "run.csv"}

@@ -107,7 +107,9 @@ def test_warnings_are_those_of_the_result_and_findings_those_of_the_new_log(here
         assert [warning["code"] for warning in found["warnings"]] == ["drift"]
 
 
-def test_of_two_logs_the_one_that_was_fitted_shows_no_prediction_and_the_other_does(here):
+def test_of_two_logs_the_one_that_was_fitted_shows_no_prediction_and_the_other_does(
+    here, monkeypatch
+):
     folder, first, other = here
     for name, log in (("new", other), ("old", first)):
         write_log(log, folder / f"{name}.csv")
@@ -121,6 +123,8 @@ def test_of_two_logs_the_one_that_was_fitted_shows_no_prediction_and_the_other_d
         own = found["validation"][names.index("new")]
         assert own["per_joint"] == alone["validation"][0]["per_joint"]
         assert found["verdict"] == alone["verdict"]
+        fault = Finding("torque_sign", "error", "old.csv: joint_1", "the torque is reversed")
+        monkeypatch.setattr("robotid.cli.validate.diagnose", lambda *_, f=fault: [f])
     write_log(rows(first, slice(0, 700)), folder / "cut.csv")
     found = validate(result, [folder / "old.csv", folder / "cut.csv"])
     assert (

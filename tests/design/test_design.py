@@ -475,13 +475,13 @@ def test_the_last_row_is_the_end_of_the_motion_where_it_rests(rng, tmp_path, suf
 
 
 def test_ros_reads_it_as_a_joint_trajectory(motion, tmp_path):
-    path = write_motion(motion, JOINTS, 2.0, 10.0, tmp_path / "m.yaml")
+    path = write_motion(motion, JOINTS, 2.0, 40.0, tmp_path / "m.yaml")
     content = yaml.safe_load(path.read_text())
     assert content["joint_names"] == list(JOINTS)
-    assert len(content["points"]) == 21
-    for k, seconds in ((7, 0), (17, 1)):
+    assert len(content["points"]) == 81
+    for k, seconds, rest in ((7, 0, 175_000_000), (41, 1, 25_000_000)):
         point = content["points"][k]
-        assert point["time_from_start"] == {"sec": seconds, "nanosec": 700_000_000}
-        q, v, a = motion.evaluate(np.array([k / 10]))
+        assert point["time_from_start"] == {"sec": seconds, "nanosec": rest}
+        q, v, a = motion.evaluate(np.array([k / 40]))
         for name, values in (("positions", q), ("velocities", v), ("accelerations", a)):
             np.testing.assert_allclose(point[name], values[0], atol=1e-6)

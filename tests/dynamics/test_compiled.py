@@ -9,7 +9,7 @@ from robotid.dynamics import factors, rows
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import compress
 from robotid.dynamics.rows import COMPILED, TrajectoryRows, friction_speeds
-from robotid.dynamics.torque import build_problem, joint_torque_regressor
+from robotid.dynamics.torque import build_problem, joint_torque_regressor, predict
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -75,7 +75,10 @@ def test_compiled_rows_are_pinocchios_on_random_trees(seed, tmp_path):
 def test_a_mimic_joint_follows_at_its_ratio_above_and_beside_its_leader(tmp_path, rng):
     model = mimicking(tmp_path, rng)
     assert model.joints == ("j1", "j4")
-    assert_is_pinocchio(model, motion(model, rng, 64))
+    assert_is_pinocchio(model, m := motion(model, rng, 64))
+    pi = model.standard_parameters()
+    W = joint_torque_regressor(model, m.q, m.v, m.a, m.direction)
+    np.testing.assert_allclose((W @ pi).reshape(-1, 2), predict(model, [pi], m)[0], atol=1e-9)
 
 
 @pytest.mark.parametrize("reach", [1e-9, 1.0, 1e3, 1e5])

@@ -42,12 +42,12 @@ JOINT = (
 
 def mimicking(folder, rng, **options):
     """Return a robot whose second and third joint follow the first, which carries the second."""
-    mimic = '<mimic joint="j1" multiplier="-2.5" offset="0.3"/></joint>'
-    parts = [LINK.format("l0")]
+    mimic = '<mimic joint="j1" multiplier="{}" offset="0.3"/></joint>'
+    parts, ends = [LINK.format("l0")], {2: mimic.format(-2.5), 3: mimic.format(-1)}
     for i, parent in ((1, 0), (2, 1), (3, 0), (4, 2)):
         text = {k: " ".join(map(str, rng.standard_normal(3))) for k in ("axis", "xyz", "rpy")}
         joint = JOINT.format(i=i, kind="revolute", parent=parent, **text)
-        parts += [LINK.format(f"l{i}"), joint.replace("</joint>", mimic) if i in (2, 3) else joint]
+        parts += [LINK.format(f"l{i}"), joint.replace("</joint>", ends.get(i, "</joint>"))]
     (folder / "tree.urdf").write_text(f'<robot name="tree">{"".join(parts)}</robot>')
     return RobotModel.from_urdf(folder / "tree.urdf", mimic="coupled", **options)
 

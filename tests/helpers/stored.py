@@ -40,7 +40,7 @@ _LEFT_OUT = {
 _NUMBER = re.compile(r"(?<![\w.])[-−+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w]|\.\d)")
 _VARIES = re.compile(
     r"\b\d+(?:\.\d+)? (?:ms|s|min) of (?:processor|wall)|\d+\.\d+\.\d+|\bin \d+\.\d s\b"
-    r"|\b\d+\.\d s(?=, \d+ start)|(?<=\| platform \| \(code\) ).+"
+    r"|\b\d+\.\d s(?=, \d+ start)|(?<=\| platform \| ).+"
 )
 
 

@@ -6,8 +6,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.legged import recorded, with_other_bodies
+from helpers.replay_data import leave_out_meshes, shown
 
 import robotid
+from robotid.cli.replay import replay_identified
 from robotid.data.base_motion import BaseMotion
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.estimators import WLS
@@ -78,7 +80,7 @@ def test_the_bodies_of_another_simulator_are_found(found):
     assert abs(before[masses].sum() / truth[masses].sum() - 1.0) > 0.02
 
 
-def test_unseen_motion_is_predicted_and_judged_by_the_joints(found):
+def test_unseen_motion_is_predicted_judged_and_drawn_by_the_joints(found, monkeypatch):
     result, _, before = found
     (metrics,) = result.predictions.values()
     joints = [metrics.per_joint[joint] for joint in result.model.joints]
@@ -95,6 +97,10 @@ def test_unseen_motion_is_predicted_and_judged_by_the_joints(found):
     ratio = result.standard[masses].sum() / before[masses].sum()
     assert [check.scale, check.factor] == pytest.approx([ratio, ratio])
     assert check.is_total_determined
+    leave_out_meshes(monkeypatch)
+    other = replace(result, estimate=replace(result.estimate, sigma=np.arange(1.0, 19.0)))
+    noise = shown(replay_identified(other).html)["torques"]["scale"]["of"]
+    np.testing.assert_allclose(noise, np.arange(7.0, 19.0))  # without the rows of the base
 
 
 def test_the_residual_at_the_truth_is_the_noise(found):

@@ -126,7 +126,11 @@ def test_the_inertial_vector_is_in_the_papers_order(shown, content, folder, html
     np.testing.assert_allclose(found[[4, 6, 14, 16]], true[[4, 6, 14, 16]] / 2)
 
 
-def test_the_page_is_good_only_if_every_model_has_converged(content):
+def test_the_page_is_good_only_if_every_model_has_converged(content, shown):
+    table = shown["Relative error |P̂ − P| / |P|"].rows
+    for row, model in zip(table, content["models"].values(), strict=True):
+        errors = [number(model["relative_error"][k], ".2g") for k in (0, 1, 10, -1)]
+        assert row[1:5] == errors
     for last, status in (((5e-5, 5e-5, 9e-5), "good"), ((5e-5, 2e-4, 5e-5), "poor")):
         models = {
             name: {**model, "relative_error": [0.5, error]}
@@ -192,6 +196,8 @@ def test_figure_3_is_the_program_motion_of_its_joint():
     shape = 10 * t**3 - 15 * t**4 + 6 * t**5  # (28)
     rate, curvature = (30 * t**2 * (1 - t) ** 2 / 2, 60 * t * (1 - t) * (1 - 2 * t) / 4)
     parts = [amplitude * x for amplitude in (1.0, 1.5) for x in (shape, rate, curvature)]
+    labels = [what["series"][0]["label"].split()[0] for what in drawn]
+    assert labels == 2 * ["position", "velocity", "acceleration"]
     for what, wanted in zip(drawn, parts, strict=True):
         close(what["x"], 2.0 * t)
         close(what["series"][0]["y"], wanted)

@@ -55,6 +55,8 @@ def test_every_example_robot_with_a_joint_opens_and_the_others_are_refused():
     assert set(refused) == {"ur3.urdf", "quadrotor_base.urdf", "iris_simple.urdf"}
     assert "<robot> has no name" in refused["ur3.urdf"]
     assert "has no movable joint" in refused["iris_simple.urdf"]
+    with pytest.raises(ModelError, match="joint 'ee_fixed_joint' is fixed in ur5"):
+        RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), joints=["ee_fixed_joint"])
 
 
 def test_standard_parameters_are_pinocchios_inertias(ur5):
@@ -580,12 +582,12 @@ def test_ratios_of_couplings_are_checked(ratio):
 @pytest.mark.parametrize("ratios", [(), (("elbow_joint", 0.0), ("wrist_1_joint", -0.0))])
 def test_a_coupling_turns_with_some_joint(ratios):
     couplings = [Coupling("good", (("elbow_joint", 0.0), ("wrist_1_joint", 1.0)))]
-    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), couplings=couplings)
-    assert "good.armature" in model.layout.names
+    path = example_urdf("ur5_robot.urdf")
+    assert "good.armature" in RobotModel.from_urdf(path, couplings=couplings).layout.names
     with pytest.raises(SettingsError, match=r"'motor' moves no joint: its ratios are \{"):
-        RobotModel.from_urdf(
-            example_urdf("ur5_robot.urdf"), couplings=[*couplings, Coupling("motor", ratios)]
-        )
+        RobotModel.from_urdf(path, couplings=[*couplings, Coupling("motor", ratios)])
+    with pytest.raises(SettingsError, match="passive has elbow_joint, wanted joints that"):
+        RobotModel.from_urdf(path, couplings=[GEARED], passive=["elbow_joint"])
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from robotid.robot.bodies import (
     body_boxes,
     body_points,
     central_inertial,
+    density_share,
     find_mesh,
     held_parameters,
     kinematic_lengths,
@@ -251,6 +252,9 @@ def test_the_least_density_of_a_body_is_that_of_its_ellipsoid():
     assert least_density(pi) == pytest.approx(m / (4.0 / 3.0 * np.pi * a.prod()))
     assert least_density(np.zeros(10)) == 0.0
     assert least_density(np.array([1.0, *np.zeros(9)])) == np.inf
+    pi = np.array([1.0, 0, 0, 0, 1.0, 0, 1.0, 0, 0, 2.0])  # a disc: half of the draws are no body
+    share = density_share(pi, np.diag([*np.zeros(9), 1e-2]), 1e9, np.random.default_rng(0))
+    assert share == 1.0
 
 
 def test_principal_moments_are_those_of_a_turned_body():

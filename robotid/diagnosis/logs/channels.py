@@ -54,8 +54,8 @@ _AROUND = 10  # ... at most so many rows of each
 _LENGTHS = {"": 1.0, "mm": 1e-3, "cm": 1e-2}  # [m]
 _ANGLES = {"": 1.0, "degrees": np.pi / 180}  # [rad]
 _HARDLY = {"rad": 0.2, "m": 0.05}  # smaller range: the joint hardly moves
-_PLATEAU = 5  # consecutive rows at the limit of a clipped channel ...
-_CLIPPED = 0.01  # ... and share of all rows
+_SMOOTHED = 9  # rows of the mean torque that is compared with its largest value ...
+_FLAT = 0.75  # ... and share of rows there from which it is clipped
 _AWAY = 0.2  # of its largest value, above which a torque is not 0 any more
 _SEVERAL = 3  # torques without sign, and times that each reaches 0 and increases again, at least
 _REGULAR = 0.8  # share of holds of about one length that a quantised torque does not reach
@@ -450,10 +450,7 @@ def check_torque_channels(log: Log) -> Iterator[Finding]:
     if not log.tau.any():
         yield finding("constant_torque", log.name, severity="error", kind="all", cure="all")
         return
-    moving = np.append((np.diff(log.q, axis=0) != 0).any(axis=1), False)
-    for joint, x in zip(log.joints, log.tau.T, strict=True):
-        moves = bool(np.ptp(log.q[:, log.joints.index(joint)]) > STILL)
-        yield from _clipping(log, joint, x, moving, moves=moves)
+    yield from _clipping(log)
     # a single torque that is never negative may be of a joint that gravity loads in one direction
     touching = sum(_touches(x) >= _SEVERAL for x in log.tau.T)
     if log.tau.min() >= 0 and touching >= _SEVERAL:
@@ -461,22 +458,41 @@ def check_torque_channels(log: Log) -> Iterator[Finding]:
     yield from _held(log)
 
 
-def _clipping(log: Log, joint: str, x: Array, moving: Array, *, moves: bool) -> Iterator[Finding]:
-    """Yield a torque that is at a limit, or constant, in rows where the robot moves."""
-    if moving.any() and np.ptp(x) == 0:
-        value = float(x[0]) + 0.0  # no -0
-        kind = "undriven" if moves and value == 0.0 else "dead"
-        words = {"kind": kind, "cure": kind, "quoted": quoted(joint)}
-        yield finding("constant_torque", log.name, joint, value=value, **words)
-        return
-    step = units.quantum(x)
-    for limit in (float(x.max()), float(x.min())):
-        at = (x == limit) & moving
-        share = float(at.mean())
-        plateau = max((stop - start for start, stop in runs_of(at)), default=0)
-        is_coarse = step > 0 and np.ptp(x) / step < units.COARSE
-        if share >= _CLIPPED and plateau >= _PLATEAU and not is_coarse:
-            yield finding("clipped", log.name, joint, limit=limit, share=share)
+def _clipping(log: Log) -> Iterator[Finding]:
+    """Yield the torques that are constant, or at a limit, where the robot moves."""
+    # Rows that reach the largest value are compared with those down to four times as far from it:
+    # half of them at a maximum, 0.71 at one without curvature. Equal values need no comparison.
+    from scipy.ndimage import uniform_filter1d  # takes long to import
+
+    moving = np.append((np.diff(log.q, axis=0) != 0).any(axis=1), False)
+    ahead = np.minimum(np.arange(len(log.t)) + _SMOOTHED, len(log.t) - 1)
+    own = np.abs(log.q[ahead] - log.q) > AT_REST * (log.t[ahead] - log.t)[:, None]  # (N, n)
+    noise = _white_noise(log.t, log.tau)
+    for j, (joint, x) in enumerate(zip(log.joints, log.tau.T, strict=True)):
+        if moving.any() and np.ptp(x) == 0:
+            is_undriven = np.ptp(log.q[:, j]) > STILL and not x.any()
+            words = dict.fromkeys(("kind", "cure"), "undriven" if is_undriven else "dead")
+            value = float(x[0]) + 0.0  # no -0
+            yield finding(
+                "constant_torque", log.name, joint, value=value, quoted=quoted(joint), **words
+            )
+            continue
+        band = (BEYOND_NOISE + 1) * noise[j] / np.sqrt(_SMOOTHED)  # from 3 errors above to 1 below
+        step = units.quantum(x)
+        if not own[:, j].any() or 0 < np.ptp(x) < units.COARSE * step:
+            continue
+        for sign in (1.0, -1.0):
+            y = uniform_filter1d(sign * x, _SMOOTHED, mode="nearest")
+            depth = y[own[:, j]].max() - y
+            at = (depth <= band) & own[:, j]
+            runs = [(i, k) for i, k in runs_of(depth <= 4 * band) if at[i:k].any()]
+            near = sum(int(own[i:k, j].sum()) for i, k in runs)
+            is_flat = at.sum() > _FLAT * near and 4 * band < np.median(depth)
+            limit = float(np.median(x[at])) if is_flat else sign * float(np.max(sign * x))
+            width = BEYOND_NOISE * noise[j] if is_flat else 0.0
+            rows = np.sum((np.abs(x - limit) <= width) & moving)
+            if rows >= max(_SMOOTHED, SHARE_OF_ROWS * len(x)):
+                yield finding("clipped", log.name, joint, limit=limit, share=rows / len(x))
 
 
 def _touches(x: Array) -> int:

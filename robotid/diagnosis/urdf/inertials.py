@@ -204,6 +204,7 @@ def audit_bodies(model: RobotModel, pi: Array, points: Mapping[str, Array]) -> I
             if faults:  # the collision geometry may be a stand-in
                 everything = body_points(model, with_visual=True)
                 faults = list(_against_geometry(body, J_i, everything.get(body, points[body])))
+                is_note |= body not in everything  # its visual is a mesh that is not there
         else:
             faults = list(_against_kinematics(body, J_i, lengths.get(body, np.inf), model.length))
             is_note |= body not in inner

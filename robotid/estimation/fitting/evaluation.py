@@ -406,8 +406,8 @@ def _rows_in(sampled: Array, rows: Array) -> Array:
     """Return which sampled rows (m, 2 n) of positions and torques are among rows, shape (m,)."""
     is_in = np.isin(sampled[:, 0], rows[:, 0])
     likely = rows[np.isin(rows[:, 0], sampled[is_in, 0])]
-    for k in np.flatnonzero(is_in):
-        is_in[k] = (likely == sampled[k]).all(axis=1).any()
+    for k in np.flatnonzero(is_in):  # a row at rest occurs more than once
+        is_in[k] = (likely == sampled[k]).all(axis=1).sum() == 1
     return is_in
 
 

@@ -11,6 +11,8 @@ from robotid.base.exceptions import NotConvergedError
 from robotid.base.text import period
 from robotid.base.typing import Array
 from robotid.data.log import Log
+from robotid.diagnosis.decisions import BETTER, DIFFERS, SCATTERED
+from robotid.diagnosis.logs.command_channels import EXCITED, SECONDS
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, Loops, cut_windows
 from robotid.estimation.fitting.evaluation import Extent, JointMetrics, Metrics
 
@@ -72,6 +74,30 @@ class PositionEvaluation:
         if self.is_driven or self.log.q_ref is None:
             return np.ones(len(self.rmse), dtype=bool)
         return np.asarray(np.ptp(self.log.q_ref, axis=0) > 0)
+
+    def valid_band(self, j: int) -> dict[str, float] | None:
+        """Return the frequency above which all errors of a joint are large, and its errors.
+
+        Errors below and above it are relative to the motion, at frequencies of the command [-].
+        """
+        from scipy.ndimage import median_filter
+        from scipy.signal import welch
+
+        longest = max(cut_windows(self.log, np.inf, 0.0), key=lambda w: w.stop - w.first)
+        q, q_ref = self.log.q, np.asarray(self.log.q_ref)
+        signals = np.stack([q_ref, q, q - self.q])[:, longest.counted, j]
+        n = min(signals.shape[1], round(SECONDS / longest.dt))
+        f, powers = welch(signals, 1 / longest.dt, nperseg=n, detrend="linear")
+        used = (powers[0] > EXCITED * powers[0].max()) & (f > 0)
+        f, (_, motion, error) = f[used], powers[:, used]
+        share = median_filter(np.sqrt(error / motion), size=2 * SCATTERED - 1, mode="nearest")
+        k = 1 + int(np.flatnonzero(share <= DIFFERS).max(initial=-1))
+        if not SCATTERED <= k <= len(f) - SCATTERED:
+            return None
+        below = float(np.sqrt(error[:k].sum() / motion[:k].sum()))
+        above = float(np.sqrt(error[k:].sum() / motion[k:].sum()))
+        figures = {"frequency": float(f[k]), "below": below, "above": above}
+        return figures if below < BETTER * above else None
 
     def to_dict(self, name: str = "estimate") -> dict[str, Any]:
         """Return the log and its errors as plain values, as result.json has them."""

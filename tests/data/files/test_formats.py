@@ -652,7 +652,7 @@ BROKEN = [
     (".h5", hdf5_with(time=T, q=T[:, None], tau=T[:, None], joints=np.array([b"\xff\xfe"])),
      "a name in joints is not UTF-8 text"),
     (".h5", hdf5_with(time="now", q="here", tau_a=["x"] * 20), "has no column 'time'"),
-    (".parquet", lambda path: path.write_bytes(b"PAR1 not really"), "broken Parquet file"),
+    (".parquet", lambda path: path.write_bytes(b"PAR1 not really"), r"file \(ArrowInvalid: Parq"),
 ]  # fmt: skip
 
 

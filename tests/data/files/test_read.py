@@ -199,6 +199,7 @@ REFUSED = {
     "no gains, no torque": (
         dict(tau_elbow=None, tau_shoulder=None, i_elbow=ONE), {}, "--gain elbow=..., or", "No "
         "torque of shoulder was found; if at rest, lock", "with --lock shoulder=0. A payload"),
+    "no gains, no positions": (NO_Q | NO_TAU | dict(i_elbow=ONE), {}, "no columns 'q_shoulder', "),
     "NaN": (dict(tau_elbow=spoilt(T, 34, np.nan)), {}, "log: tau_elbow is NaN at row 34 (t = 1000.3"
             "4 s); remove the row or correct the recording"),
     "huge": (dict(q_elbow=spoilt(T, 9, 1e308)), {}, "q_elbow is 1e+308, which is implausibly larg"),

@@ -95,6 +95,9 @@ def test_another_vertical_axis_of_the_world_is_named(robot, log, axis, down):
     assert f"state gravity = [0, {down}, 0] at the top" in found.message
     assert abs(found.evidence["height"]) < 0.2
     assert found.evidence["best"] > 0.9
+    (found,) = check_base(robot, with_quaternion(other, QUATERNIONS[0][0]), SLOW)
+    assert "its order is qw qx qy qz" in found.message
+    assert f"gravity = [0, {down}, 0]" in found.message
     stated = RobotModel.from_urdf(
         robot.tree.path, free_flyer=True, terms=(), constraints=robot.contacts,
         gravity=(0.0, down, 0.0),

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.corruptions import controlled_log, robot
 from helpers.findings import Figures
 
 from robotid.data.log import Log, Trajectory
@@ -283,6 +284,22 @@ def test_a_torque_is_clipped_at_either_limit_and_held_by_groups():
         "run.csv: b, d": pytest.approx({"rows": 4.0, "delay": 0.015}),
         "run.csv: c": pytest.approx({"rows": 7.0, "delay": 0.03}),
     }
+
+
+@pytest.mark.parametrize(("noise", "least"), [(0.005, 9), (0.02, 8)])
+def test_a_torque_that_is_clipped_under_noise_is_named_and_no_other(noise, least):
+    model, named = robot("panda"), 0
+    log, rng = controlled_log("panda", 1), np.random.default_rng(0)
+    level = noise * log.tau.std(axis=0)
+    for share in (1.0, 0.75, 0.6):
+        limit = share * np.abs(log.tau).max(axis=0)
+        tau = np.clip(log.tau, -limit, limit) + level * rng.standard_normal(log.tau.shape)
+        for finding in check_torque_channels(replace(log, tau=tau)):
+            j = model.joints.index(finding.joints[0])
+            assert (finding.code, share < 1.0) == ("clipped", True)
+            assert abs(finding.evidence["limit"]) == pytest.approx(limit[j], abs=2 * level[j])
+            named += 1
+    assert named >= least
 
 
 # --- clock, rows and rests ------------------------------------------------------------------------

@@ -196,6 +196,53 @@ def test_a_command_that_the_drive_had_before_is_an_error(log, early):
     assert errors[0].evidence["lag"] < -early / 2
 
 
+def test_exchanged_and_reversed_commands_are_errors(log):
+    (order,) = found(replace(log, q_ref=log.q_ref[:, ::-1])).values()
+    assert (order.code, order.severity) == ("command_order", "error")
+    assert order.joints == log.joints
+    assert "joint_0 follows qref_joint_1, joint_1 follows qref_joint_0" in order.message
+    assert order.evidence["unexplained_so_read"] < 0.05 < 0.8 < order.evidence["unexplained"]
+    (sign,) = found(replace(log, q_ref=log.q_ref * [1.0, -1.0])).values()
+    assert (sign.code, sign.severity, sign.where) == ("command_sign", "error", "log: joint_1")
+    assert "negate qref_joint_1" in sign.message
+
+
+@pytest.mark.parametrize(("sign", "side"), [(1.0, "largest"), (-1.0, "smallest")])
+def test_an_end_stop_is_named_with_its_position(log, sign, side):
+    noise = 1e-4 * np.random.default_rng(1).standard_normal(log.q.shape)
+    stopped = sign * np.minimum(sign * log.q, [0.17, 1.0]) + noise
+    (stop,) = found(replace(log, q=stopped)).values()
+    assert (stop.code, stop.severity, stop.where) == ("end_stop", "warning", "log: joint_0")
+    assert f"stays at its {side} position of {sign * 0.17:.2g} rad" in stop.message
+    assert sign * stop.evidence["command"] == pytest.approx(0.3, abs=0.01)
+
+
+def test_a_drive_that_is_off_for_some_seconds_is_named():
+    def commands(t):
+        return 0.2 * np.sin(np.outer(t, [3.0, 4.1])) + 0.1 * np.sin(np.outer(t, [7.0, 5.3]))
+
+    log = record(commands, GOOD)
+    q, off = log.q.copy(), slice(1000, 1800)  # 5 s to 9 s
+    q[off, 1] = q[1000, 1]
+    rest = found(replace(log, q=q))["not_followed"]
+    assert (rest.severity, rest.where) == ("warning", "log: joint_1")
+    assert Figures(rest) == {"seconds": pytest.approx(4.0, abs=0.3)}
+    assert "first at t = 5" in rest.message
+    q[:, 1] = 0.1 + 1e-4 * np.random.default_rng(1).standard_normal(len(q))
+    never = found(replace(log, q=q))["not_followed"]
+    assert "its drive is off, or a brake, an obstacle or friction holds it" in never.message
+
+
+def test_a_loop_that_gravity_deflects_need_not_move_farther():
+    t = np.arange(0.0, 20.0, 0.005)
+    q_ref = np.abs((0.5 * t + [[0.3], [0.8]]) % 2.0 - 1.0).T  # triangles of 4 s
+    noise = 1e-4 * np.random.default_rng(1).standard_normal(q_ref.shape)
+    log = Log(t, 0.4 * q_ref + noise, 0 * q_ref, ("a", "b"), q_ref=q_ref, has_torque=False)
+    weak = found(log)["small_command"].message
+    assert "follows 40 % of slow sweeps of 1 rad, without a dead band: gravity or" in weak
+    assert "move it by" not in weak
+
+
 def test_a_command_that_is_held_is_noted():
     held = found(record(chirps([0.3, 0.3], 8.0), GOOD, hold=4))
     assert list(held) == ["repeated_command"]

@@ -208,8 +208,6 @@ def test_the_doctor_names_rounded_angles_that_matter_once(tmp_path, rng):
 
 UNUSABLE = {
     "missing": (None, "there is no URDF file"),
-    "no XML": ("<robot", "is not well-formed XML"),
-    "other XML": ("<sdf/>", "the top element is <sdf>, wanted <robot>"),
     "no name": ("<robot/>", "<robot> has no name"),
     "no joint": ('<robot name="r"><link name="l"/></robot>', "has no movable joint"),
 }
@@ -343,6 +341,23 @@ def test_what_the_geometry_does_not_allow_is_named_with_its_figure(
     assert found[0].where == "link upper"
     if evidence is not None:
         assert {key: found[0].evidence[key] for key in evidence} == pytest.approx(evidence)
+
+
+@pytest.mark.parametrize(
+    ("shape", "severities"),
+    [
+        ('<box size="0.9 0.9 0.9"/>', []), ('<box size="0.1 0.1 0.1"/>', ["warning"]),
+        ('<mesh filename="package://arm/missing.stl"/>', ["note"]),
+    ],
+)  # fmt: skip
+def test_a_collision_stand_in_is_judged_with_the_visual(tmp_path, shape, severities):
+    visual = f"<visual><geometry>{shape}</geometry></visual>"
+    path = tmp_path / "arm.urdf"
+    path.write_text(ARM.format(**(GOOD | {"com": "0.2 0 0.3"})).replace(
+        '<collision><origin xyz="0.2 0 0"/>', f'{visual}<collision><origin xyz="0.2 0 0"/>'
+    ))  # fmt: skip
+    found = audit_links(RobotModel.from_urdf(path))
+    assert [f.severity for f in found if f.code == "com_outside"] == severities
 
 
 def test_what_hardly_weighs_hardly_matters(tmp_path):

@@ -3,6 +3,7 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.robots import JOINT
 
 from robotid.dynamics.kernels import lanes, tree_lanes
 from robotid.dynamics.kernels.lanes import LANES
@@ -12,11 +13,6 @@ from robotid.robot.model import RobotModel
 LINK = (
     '<link name="l{i}"><inertial><origin xyz="{xyz}" rpy="{rpy}"/><mass value="{mass}"/>'
     '<inertia ixx="1.3" iyy="1.1" izz="0.9" ixy="0.2" ixz="-0.1" iyz="0.15"/></inertial></link>'
-)
-JOINT = (
-    '<joint name="j{i}" type="{kind}"><parent link="l{parent}"/><child link="l{i}"/>'
-    '<axis xyz="{axis}"/><origin xyz="{xyz}" rpy="{rpy}"/>'
-    '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
 )
 # a tree that branches twice, of revolute and prismatic joints, all axes tilted
 PARENTS = (0, 1, 2, 2, 1, 5, 0)

@@ -132,6 +132,7 @@ def test_usual_friction_of_a_coupled_drive_is_over_the_rows_that_all_of_its_join
     np.testing.assert_allclose(asked.torque, X @ found.standard[k], rtol=1e-12)
     assert asked.load == 3.0
     assert repr(Fit.friction(found, "pair", [])) == "<FrictionCurve: no speeds>"
+    assert repr(Fit.friction(found, "pair", [1 / 3])).endswith("1 speeds, 0.3333 to 0.3333>")
 
 
 def test_usual_friction_that_depends_on_the_load_is_that_at_its_rms_over_the_rows_used(rng):

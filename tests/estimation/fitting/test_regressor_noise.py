@@ -143,7 +143,7 @@ def many(model, motion, count=24, looked=6):
     return np.array(errors), *(list(x) for x in zip(*few, strict=True))
 
 
-def test_the_shift_is_what_many_encoders_move_least_squares_by(runs):
+def test_the_shift_is_what_many_encoders_move_least_squares_by(runs, planar, motion):
     errors, noises, _, _ = runs
     mean, scatter = errors.mean(axis=0), errors.std(axis=0)
     shift = np.array([noise.shift for noise in noises])
@@ -154,7 +154,8 @@ def test_the_shift_is_what_many_encoders_move_least_squares_by(runs):
     assert (np.abs(shift.mean(axis=0) - mean) < 3.5 * uncertain).all()
     worst = int(np.argmax(np.abs(mean) / scatter))
     assert shift[:, worst].mean() == pytest.approx(mean[worst], rel=0.15)
-    np.testing.assert_allclose(noises[0].steps, [STEP, STEP])
+    rare = found_in(planar, recorded(planar, [x[::12] for x in motion]))  # most rows differ
+    np.testing.assert_allclose([noises[0].steps, rare.steps], STEP)
 
 
 def test_intervals_hold_the_truth_behind_the_correction_and_not_without_it(runs):

@@ -252,6 +252,7 @@ def test_robots_bounds_and_two_logs(leg):
     _, hip = loop_runs(robot.model, simulator, bound, ["b", "b", "a", "a"])
     assert hip.group.parameters == ("hip.kp",)
     assert hip.runs.unit.tolist() == [1, 1, 0, 0]
-    logs = list(dict.fromkeys(window.log for window in simulator.windows))[:2]
-    two = replace(simulator, windows=tuple(w for w in simulator.windows if w.log in logs))
-    assert loop_runs(robot.model, two, estimate) == ()
+    logs = list(dict.fromkeys(window.log for window in simulator.windows))
+    for count, groups in ((2, 0), (3, 2)):
+        own = tuple(w for w in simulator.windows if w.log in logs[:count])
+        assert len(loop_runs(robot.model, replace(simulator, windows=own), estimate)) == groups

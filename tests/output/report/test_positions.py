@@ -10,7 +10,7 @@ from helpers.pages import charts
 
 from robotid.base.findings import Finding
 from robotid.output.report.next_steps import Origin
-from robotid.output.report.report_content import Residual, worst_second, write_report
+from robotid.output.report.report_content import Clip, Dock, Residual, worst_second, write_report
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +40,8 @@ def test_the_worst_second_is_in_mrad_and_the_replay_knows_when_each_log_ends(fou
     clips = json.loads(unescape(re.search(r'data-clips="(.*?)"', page)[1]))
     ends = [(e.log.t[0], e.log.t[-1]) for e in (*found.validation, *found.fitted)]
     assert [(clip["start"], clip["end"]) for clip in clips] == ends
+    shown = [Clip("a", "", 0.0, 1.0), Clip("b", "b.csv", 0.0, 1.0)]  # one of arrays, one of a file
+    assert Dock("", Origin((), "out", "replay.html"), "arm.urdf", shown).file == "replay.html"
 
 
 def test_without_validation_the_fitted_logs_are_shown_and_a_torque_is_no_command(found, tmp_path):
