@@ -140,7 +140,10 @@ def _of_robot(
         Reading(
             "joint_origin", 0.01, one + every, lambda on: by.by_origin[:, :, on > 0].reshape(shape)
         ),
-        Reading("axis_direction", 0.03, one, lambda on: by.by_axis[:, :, on > 0].reshape(shape)),
+        Reading(
+            "axis_direction:residual", 0.03, one,
+            lambda on: by.by_axis[:, :, on > 0].reshape(shape),
+        ),
     )  # fmt: skip
 
 
