@@ -522,7 +522,7 @@ def _other_gains(result: PositionIdentification) -> Iterator[Finding]:
 
 def _valid_bands(result: PositionIdentification) -> Iterator[Finding]:
     """Yield up to which frequency the model predicts a joint whose position error is not small."""
-    for run in result.validation or result.fitted:
+    for run in (result.validation or result.fitted) if result.has_gains else ():
         for j in np.flatnonzero(_relative_errors(run) > GOOD_POSITION).tolist():
             band = run.valid_band(j)
             if band is not None and 100.0 * band["below"] < GOOD_POSITION:
