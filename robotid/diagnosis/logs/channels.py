@@ -21,9 +21,12 @@ from robotid.diagnosis.decisions import (
     DIFFERS,
     FEWEST,
     NO_ERROR_OF_MASSES,
+    OUTLIER,
     ROWS,
+    SCATTERED,
     SEGMENTS,
     SHARE_OF_ROWS,
+    SIGNIFICANT,
 )
 from robotid.robot.parameters import ParameterLayout
 from robotid.robot.tree import Joint
@@ -31,24 +34,15 @@ from robotid.robot.tree import Joint
 MOVING = 0.1  # Share of the log in which a joint must move
 ZERO = 0.05  # Share of its largest value, below which a torque that is never negative is 0
 _LEAST = {"q": STATIC, "dq": AT_REST}  # [rad or m, rad/s or m/s] smaller values: at rest
-_LEAST_TORQUE = 0.01  # share of the median joint's torque below which a torque is negligible
-_SPIKE = 15.0  # distance of a spike over the typical one ...
-_BEYOND = 1.5  # ... and over the amplitude
-_ABSURD = 5.0  # ... above which it is no motion
-_HARM = 0.02  # share of the energy of its channel with which it ruins a least-squares fit
-_NOISY = 0.3  # noise over signal from which a torque is uninformative
-_LAG = 0.002  # [s] a shorter lag is not reported
+_BEYOND = 1.5  # deviation of a spike over the amplitude
 _BITS = range(9, 24)  # of encoders
-_ENCODER = 0.01  # [bits] difference of a step from 2 pi / 2^bits
-_CLOCK = 0.01  # relative error of the clock from which it is reported: 2 % of an inertia
+_OTHER = 0.01  # relative difference from which a clock, or the step of an encoder, is another one
 _RPM = 30 / np.pi  # [1/min per rad/s]
 _LONG = 0.05  # [s] a longer gap is a warning
-_BUNCHED = 0.2  # [mean steps] a shorter step is of rows that were stamped together ...
-_CLOCK_ALIKE = 0.3  # ... if more than this share of the mean motion per row is in them
+_BUNCHED = 0.2  # [mean steps] a shorter step is of rows that were stamped together
 # [s] A longer rest at an end is reported; in a longer gap, a position that moves as in one step
 # shows that the clock was set.
 _PAUSE = 1.0
-_STALE = 0.05  # share of stale rows from which they are a warning
 _CONTINUES = 0.15  # motion after repeated rows, over that in as many rows before and after ...
 _AROUND = 10  # ... at most so many rows of each
 _LENGTHS = {"": 1.0, "mm": 1e-3, "cm": 1e-2}  # [m]
@@ -56,8 +50,6 @@ _ANGLES = {"": 1.0, "degrees": np.pi / 180}  # [rad]
 _HARDLY = {"rad": 0.2, "m": 0.05}  # smaller range: the joint hardly moves
 _SMOOTHED = 9  # rows of the mean torque that is compared with its largest value ...
 _FLAT = 0.75  # ... and share of rows there from which it is clipped
-_AWAY = 0.2  # of its largest value, above which a torque is not 0 any more
-_SEVERAL = 3  # torques without sign, and times that each reaches 0 and increases again, at least
 _REGULAR = 0.8  # share of holds of about one length that a quantised torque does not reach
 
 
@@ -98,7 +90,9 @@ def _quantisation(log: Log, kind: str, values: Array, velocity: str) -> Iterator
         todo = "few" if few else "more"
         if kind == "dq" and few:
             todo = "few_auto" if velocity == "auto" else "few_velocity"
-        elif kind == "q" and abs(bits - round(bits)) < _ENCODER and round(bits) in _BITS:
+        elif (
+            kind == "q" and abs(2.0 ** (bits - round(bits)) - 1.0) < _OTHER and round(bits) in _BITS
+        ):
             todo = "few_encoder" if few else "encoder"
         names = [log.joints[j] for j in chosen]
         yield finding(
@@ -117,17 +111,17 @@ def _spikes(
 
     smooth = median_filter(values, size=(5, 1), mode="nearest")
     amplitudes = [_amplitude(*of) for of in zip(values.T, smooth.T, noise, strict=True)]
-    least = _LEAST.get(kind, _LEAST_TORQUE * float(np.median(amplitudes)))
+    least = _LEAST.get(kind, ZERO * float(np.median(amplitudes)))
     for j, (joint, x) in enumerate(zip(log.joints, values.T, strict=True)):
         amplitude, deviation = max(amplitudes[j], least), x - smooth[:, j]
         typical = max(1.48 * float(np.median(np.abs(deviation))), noise[j])
-        smallest = max(_BEYOND * amplitude, _SPIKE * typical)
+        smallest = max(_BEYOND * amplitude, OUTLIER * typical)
         rows = np.flatnonzero(np.abs(deviation) > smallest)
         if len(rows) == 0:
             continue
         largest, first = np.abs(deviation[rows]).max(), float(log.t[rows[0]])
         energy = np.sum(deviation[rows] ** 2) / np.sum((x - np.median(x)) ** 2)
-        is_harmful = is_used and largest > _ABSURD * amplitude and energy > _HARM
+        is_harmful = is_used and largest > SIGNIFICANT * amplitude and energy > SHARE_OF_ROWS
         yield finding(
             "spikes", log.name, joint, subject=f"{kind}_{joint}", channel=kind,
             severity="error" if is_harmful else "note", rows=len(rows), largest=largest,
@@ -142,7 +136,7 @@ def _noise(log: Log, kind: str, values: Array, noise: Array) -> Iterator[Finding
     evidence = dict(zip(log.joints, noise.tolist(), strict=True))
     levels = ", ".join(f"{level:.2g}" for level in noise)
     yield finding("noise", log.name, subject=kind, channel=kind, levels=levels, **evidence)
-    for j in np.flatnonzero(share > _NOISY) if kind == "tau" else ():
+    for j in np.flatnonzero(share**2 > DIFFERS) if kind == "tau" else ():
         yield finding("noisy_torque", log.name, log.joints[j], share=share[j])
 
 
@@ -177,7 +171,7 @@ def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
     scatter = float(np.median(np.abs(used - lag))) * 1.48 if len(used) else 0.0
     step = float(np.median(np.diff(log.t)))
     error = max(scatter / np.sqrt(max(len(used), 1)), 0.02 * step)
-    if abs(lag) < max(_LAG, BEYOND_NOISE * error, 0.1 * step):
+    if abs(lag) < max(BEYOND_NOISE * error, DIFFERS * step):
         return
     is_delayed = abs(lag) >= units.LARGEST_LAG
     yield finding(
@@ -198,8 +192,8 @@ def _velocity_scale(log: Log, moved: Array, integral: Array, velocity: str) -> I
     every = np.array([*factors.values()])
     is_known = len(factors) > 1 or len(log.joints) == 1
     factor, error = _common(*every.T) if is_known else (1.0, 0.0)
-    least = DIFFERS if units.coarse_velocities(log) else _CLOCK  # steps may be truncated
-    if abs(factor / _RPM - 1.0) < _CLOCK:
+    least = DIFFERS if units.coarse_velocities(log) else _OTHER  # steps may be truncated
+    if abs(factor / _RPM - 1.0) < _OTHER:
         factor = 1.0  # a unit of the velocities
     elif abs(factor - 1.0) > max(least, BEYOND_NOISE * error):
         yield finding(
@@ -393,7 +387,7 @@ def _bunches(log: Log, step: Array) -> Iterator[Finding]:
     share = float(np.mean(is_bunched))
     moved = np.abs(np.diff(log.q, axis=0)).mean(axis=0)
     change = np.abs(np.diff(log.q[:, int(np.argmax(moved))]))  # of the joint that moves most
-    if share < SHARE_OF_ROWS or change[is_bunched].mean() <= _CLOCK_ALIKE * change.mean():
+    if share < SHARE_OF_ROWS or change[is_bunched].mean() <= BETTER * change.mean():
         return
     usual = float(np.median(step[~is_bunched]))
     yield finding(
@@ -421,7 +415,7 @@ def _stale_rows(log: Log, step: Array) -> Iterator[Finding]:
     lengths = [stop - start for start, stop in runs]
     share = sum(lengths) / len(log.t)
     yield finding(
-        "stale_rows", log.name, severity="warning" if share > _STALE else "note",
+        "stale_rows", log.name, severity="warning" if share > AGREES else "note",
         rows=sum(lengths), share=share, longest_run=max(lengths),
     )  # fmt: skip
 
@@ -452,8 +446,8 @@ def check_torque_channels(log: Log) -> Iterator[Finding]:
         return
     yield from _clipping(log)
     # a single torque that is never negative may be of a joint that gravity loads in one direction
-    touching = sum(_touches(x) >= _SEVERAL for x in log.tau.T)
-    if log.tau.min() >= 0 and touching >= _SEVERAL:
+    touching = sum(_touches(x) >= SCATTERED for x in log.tau.T)
+    if log.tau.min() >= 0 and touching >= SCATTERED:
         yield finding("unsigned_torque", log.name, joints=touching, kind="all", cure="all")
     yield from _held(log)
 
@@ -498,7 +492,7 @@ def _clipping(log: Log) -> Iterator[Finding]:
 def _touches(x: Array) -> int:
     """Return how often a torque reaches 0 and increases again."""
     top = float(np.quantile(np.abs(x), 0.995))
-    near = runs_of(x < _AWAY * top)
+    near = runs_of(x < BETTER * top)
     return sum(x[i:k].min() < ZERO * top for i, k in near if i > 0 and k < len(x))
 
 
