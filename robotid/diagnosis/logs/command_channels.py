@@ -25,9 +25,9 @@ from robotid.diagnosis.decisions import (
 from robotid.diagnosis.logs.channels import runs_of
 from robotid.estimation.fitting.standard_errors import QUANTILE
 
-_SECONDS = 5.0  # [s] of the averaged spectra, and least total time of constant commands
+SECONDS = 5.0  # [s] of the averaged spectra, and least total time of constant commands
 _COHERENT = 0.8  # least coherence of a frequency that is used
-_EXCITED = 1e-4  # least power of a command, over that of its strongest frequency
+EXCITED = 1e-4  # least power of a command, over that of its strongest frequency
 _LONGEST = 0.5  # [s] longest delay, or lead, of a position; a joint has settled after it
 _INTERVAL = 0.05  # [s] over which signals are averaged to compare their changes
 _HALF = 0.5  # share of the power at the bandwidth, and of slow sweeps that a joint should follow
@@ -110,12 +110,12 @@ class _Loop:
         # Where the command excites it. The weight is 1 / relative variance, from the coherence.
         from scipy.signal import csd, welch
 
-        n = min(len(self.q), max(8, round(_SECONDS / self.step)))
+        n = min(len(self.q), max(8, round(SECONDS / self.step)))
         how = {"fs": 1 / self.step, "nperseg": n, "detrend": "linear"}
         f, both = csd(self.command, self.q, **how)
         command, q = welch(self.command, **how)[1], welch(self.q, **how)[1]
         share = np.abs(both) ** 2 / np.where(command * q > 0, command * q, np.inf)
-        used = (share > _COHERENT) & (command > _EXCITED * command.max()) & (f > 0)
+        used = (share > _COHERENT) & (command > EXCITED * command.max()) & (f > 0)
         segments = 2 * len(self.q) / n - 1
         share = np.minimum(share[used], 1 - AGREES**2)  # joints are not linear
         return f[used], both[used] / command[used], 2 * segments * share / (1 - share)
@@ -387,7 +387,7 @@ def _disturbed(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     for j, loop in enumerate(loops):
         settled, same = round(_LONGEST / loop.step), runs_of(np.diff(loop.command) == 0)
         runs = [(i + settled, k + 1) for i, k in same if k - i >= settled]
-        if sum(k - i for i, k in runs) * loop.step < _SECONDS:
+        if sum(k - i for i, k in runs) * loop.step < SECONDS:
             continue
         centred = np.concatenate([q[i:k] - q[i:k].mean(axis=0) for i, k in runs])
         moved, others = centred[:, j], np.delete(centred, j, axis=1)

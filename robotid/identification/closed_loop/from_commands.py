@@ -14,10 +14,18 @@ from robotid.base.typing import Array, ProgressCallback, ignore_progress, report
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import unwrap
-from robotid.diagnosis.catalogue import entries, finding
+from robotid.diagnosis.catalogue import codes_with, entries, finding
+from robotid.diagnosis.decisions import BETTER, DIFFERS, SIGNIFICANT
 from robotid.diagnosis.verdict.fit_findings import not_written, unlike_findings
 from robotid.diagnosis.verdict.parameter_table import correlated_sets
-from robotid.diagnosis.verdict.verdict import NAMED, Verdict, blocking, judge_positions
+from robotid.diagnosis.verdict.verdict import (
+    GOOD,
+    GOOD_POSITION,
+    NAMED,
+    Verdict,
+    blocking,
+    judge_positions,
+)
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.friction_projection import DriveMoments, drive_moments
 from robotid.dynamics.simulation.loops import LOOP_GAP, Loops, open_loops
@@ -47,7 +55,9 @@ from robotid.identification.closed_loop.stages import (
     CHANGE,
     STAGES,
     Fitted,
+    fit_gains,
     fit_loops,
+    fit_one_log,
     stated_loops,
 )
 from robotid.identification.result import Identification, StatedSettings
@@ -56,7 +66,10 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
 _LEAST = 0.01  # plausible change between logs, at least, over the prior standard deviation
-_CAUTIONS = ("at_bound", "coarse_steps", "gains_contradicted")  # with these no result is good
+#: With these no result is good.
+_CAUTIONS = (
+    "at_bound", "coarse_steps", "end_stop", "gains_contradicted", "not_followed", "other_gains",
+)  # fmt: skip
 _MOVING = 0.05  # smallest speed above the noise, relative to the largest speed of a joint
 _MISMATCH = 0.5  # largest relative error of a torque that the loop of its joint gives
 _KNOWN = 0.1  # standard error of a known delay, relative to the range found from one response
@@ -358,11 +371,17 @@ def loop_findings(
 ) -> tuple[Finding, ...]:
     """Return the findings of logs and fit, the most severe first."""
     settled = [_settled_delay(one, result) for one in examined]
-    return by_severity([*settled, *_of_fit(result)])
+    gains = [*_other_gains(result)]
+    causes = [one for one in settled if one.code in codes_with("names_cause")]
+    causes += [*gains, *_limits_found(result)]
+    known = {joint for one in causes for joint in one.joints}
+    bands = [one for one in _valid_bands(result) if not known.intersection(one.joints)]
+    of_fit = _of_fit(result, is_explained=bool(causes or bands))
+    return by_severity([*settled, *of_fit, *gains, *bands])
 
 
-def _of_fit(result: PositionIdentification) -> Iterator[Finding]:
-    """Yield the findings of the fit."""
+def _of_fit(result: PositionIdentification, *, is_explained: bool) -> Iterator[Finding]:
+    """Yield the findings of the fit; ``is_explained``: others name a cause."""
     estimate = result.estimate
     if not estimate.converged:
         yield finding("not_settled", subject="fit", steps=estimate.n_iter)
@@ -386,7 +405,7 @@ def _of_fit(result: PositionIdentification) -> Iterator[Finding]:
     if (halving := float(estimate.details.get("halving", 0.0))) > 1.0:
         step = float(estimate.details["step"])
         yield finding("coarse_steps", subject="fit", halving=halving, step=step, limit=CHANGE)
-    yield from _at_bound(result)
+    yield from _at_bound(result, is_explained=is_explained)
     for together in result.correlated:
         yield _named("correlated_terms:commands", together)
     if names := result.undetermined:
@@ -435,7 +454,7 @@ def _settled_delay(examined: Finding, result: PositionIdentification) -> Finding
     return examined.reworded(**settled, evidence=evidence)
 
 
-def _at_bound(result: PositionIdentification) -> Iterator[Finding]:
+def _at_bound(result: PositionIdentification, *, is_explained: bool) -> Iterator[Finding]:
     """Yield which parameters are estimated at a bound, and what to do about it."""
     loop, estimate = result.loop, result.estimate
     free_parameters, at_bound = result.fit.simulator.free_parameters, estimate.details["at_bound"]
@@ -451,8 +470,9 @@ def _at_bound(result: PositionIdentification) -> Iterator[Finding]:
     if at_zero := [name for name in at_bound if name not in {**largest, **least}]:
         stated = [name for name in ("kp", "kd", "delay") if getattr(loop, name) is not None]
         gains, remedies = [name for name in stated if name != "delay"], []
-        wrong = f", or {' or '.join(stated)} in [controller] is wrong" if stated else ""
-        if gains:
+        is_wrong = bool(stated) and not is_explained
+        wrong = f", or {' or '.join(stated)} in [controller] is wrong" if is_wrong else ""
+        if gains and is_wrong:
             remedies.append(f"compare {' and '.join(gains)} with the gains of the drive")
         if "delay" in stated:
             remedies.append("leave the delay out of [controller], so that it is fitted")
@@ -479,6 +499,41 @@ def _unequal_gains(result: PositionIdentification) -> Iterator[Finding]:
             names = [result.model.joints[j] for j in joints]
             ends, group = {"lowest": kp.min(), "highest": kp.max()}, listed(map(quoted, names))
             yield finding("unequal_gains", "", names, **ends, group=group)
+
+
+def _other_gains(result: PositionIdentification) -> Iterator[Finding]:
+    """Yield logs with other gains than the fit, of joints whose simulated positions are wrong."""
+    errors = np.array([_relative_errors(run) for run in result.fitted])
+    least, fit = np.maximum(GOOD_POSITION, errors.max(axis=0) / BETTER), result.fit
+    loops, runs, others = fit.loops, [*result.validation], "the fit"
+    if len(result.fitted) > 1 and errors.max() > GOOD:  # the logs may contradict each other
+        loops, others = fit_one_log(fit, result.fitted[0].log), result.fitted[0].log.name
+        runs, least = [*result.fitted[1:], *runs], np.full_like(least, GOOD_POSITION)
+    for run in runs if result.has_gains else ():
+        joints = np.flatnonzero(run.moves & (_relative_errors(run) > least))
+        other = fit_gains(fit.simulator, loops, run.log, joints) if len(joints) else None
+        for k, j in enumerate(joints) if other is not None else ():
+            figures = {key: float(values[k]) for key, values in vars(other).items()}
+            is_other = abs(figures["ratio"] - 1.0) > max(
+                DIFFERS, SIGNIFICANT * figures["std_error"]
+            )
+            if is_other and figures["after"] < BETTER * figures["before"]:
+                joint = result.model.joints[j]
+                yield finding("other_gains", run.log.name, joint, others=others, **figures)
+
+
+def _valid_bands(result: PositionIdentification) -> Iterator[Finding]:
+    """Yield up to which frequency the model predicts a joint whose position error is not small."""
+    for run in result.validation or result.fitted:
+        for j in np.flatnonzero(run.moves & (_relative_errors(run) > GOOD_POSITION)).tolist():
+            if (band := run.valid_band(j)) is not None:
+                figures = dict(zip(("frequency", "below", "above"), band, strict=True))
+                yield finding("model_bandwidth", run.log.name, result.model.joints[j], **figures)
+
+
+def _relative_errors(run: PositionEvaluation) -> Array:
+    """Return the errors of simulated positions, shape (n,) [% of the RMS motion]."""
+    return np.asarray(100.0 * run.rmse / np.maximum(run.spread, LEAST_DIVISOR))
 
 
 def _limits_found(result: PositionIdentification) -> Iterator[Finding]:

@@ -662,7 +662,7 @@ class GainScale:
         agree = np.abs(self.change - self.common) <= BEYOND_NOISE * error
         # missing friction terms cause smaller differences
         is_other = abs(self.common) > max(BEYOND_NOISE * self.common_error, AGREES)
-        return bool(is_other and agree.all())
+        return bool(is_other and self.common > -1.0 and agree.all())  # no gain is negative
 
 
 def gain_scale(simulator: LoopSimulator, estimator: OutputError, estimate: Estimate) -> GainScale:

@@ -170,6 +170,48 @@ def fit_loops(
 
 
 @dataclass(frozen=True, eq=False)
+class OtherGains:
+    """Gains with which one log agrees with a fit of others; arrays of shape (k,)."""
+
+    ratio: Array  # of kp to that of the fit [-]
+    std_error: Array  # of the ratio [-]
+    before: Array  # error of simulated positions with the gains of the fit [% of RMS motion]
+    after: Array  # ... and with the other ones
+
+
+def fit_one_log(fitted: Fitted, log: Log) -> Loops:
+    """Return the loops with drives and gains, but no bodies, fitted to one log."""
+    simulator, theta = fitted.simulator, fitted.estimate.theta
+    free = [k for k, x in enumerate(simulator.free_parameters) if x.what != "body"]
+    alone = replace(
+        simulator, windows=_few(cut_windows(log, _WINDOW, _LEAD)), base=fitted.loops,
+        free_parameters=tuple(simulator.free_parameters[k] for k in free),
+    )  # fmt: skip
+    return alone.loops(OutputError().minimise(alone, theta[free]))
+
+
+def fit_gains(simulator: LoopSimulator, loops: Loops, log: Log, joints: Array) -> OtherGains | None:
+    """Return the gains of joints (k,) fitted to one log, else as ``loops``; None if it fails."""
+    windows, own = _few(cut_windows(log, _WINDOW, _LEAD)), np.stack([loops.kp, loops.kd])[:, joints]
+    free = [
+        FreeParameter(f"{w} {j}", w, (j,), 0.0, np.inf, 0.0) for w in ("kp", "kd") for j in joints
+    ]
+    alone = LoopSimulator(simulator.robot, windows, loops, tuple(free))
+    # where kd grows with the root of kp, the damping ratio stays the same
+    starts = [(own * [[x], [np.sqrt(x)]]).reshape(-1) for x in 2.0 ** np.arange(-3, 4)]
+    errors = []
+    for start in starts:
+        with suppress(NotConvergedError):
+            errors.append((_errors_of(alone, alone.loops(start))[joints], start))
+    if not errors:
+        return None
+    estimate = OutputError(whitens=False).fit(alone, min(errors, key=lambda x: x[0].sum())[1])
+    ratio, error = (x[: len(joints)] / own[0] for x in (estimate.theta, estimate.std_error))
+    before, after = (_errors_of(alone, x)[joints] for x in (loops, alone.loops(estimate.theta)))
+    return OtherGains(ratio, error, before, after)
+
+
+@dataclass(frozen=True, eq=False)
 class _Task:
     """What is fitted, and how."""
 

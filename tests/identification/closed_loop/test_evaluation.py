@@ -65,6 +65,22 @@ def test_a_joint_that_no_log_moves_is_left_out_where_motion_is_wanted(arm):
     assert len(pool_positions([driven], moving=True).per_joint) == 1, "by its torque"
 
 
+def test_a_model_without_a_spring_holds_up_to_some_frequency(arm):
+    """Of two masses and a spring only the sum is simulated: below the resonance it is right."""
+    t = np.arange(4000) / 200.0
+    f = np.fft.rfftfreq(len(t), 1 / 200.0)
+    q_ref = 0.3 * np.sin(2 * np.pi * (0.1 * t + 0.1 * t**2))  # to 4.1 Hz
+    rng, one = np.random.default_rng(0), run(arm.joints, [0.02], [0.2], [1.0])
+    rigid, elastic = (1 - (f / x) ** 2 + 0.3j * f / x for x in (40.0, 6.0))
+    q, simulated = (np.fft.irfft(np.fft.rfft(q_ref) / H) for H in (elastic, rigid))
+    q += 1e-4 * rng.standard_normal(len(q))
+    log = Log(t, q[:, None], 0 * q[:, None], arm.joints, q_ref=q_ref[:, None], has_torque=False)
+    frequency, below, above = replace(one, log=log, q=simulated[:, None]).valid_band(0)
+    assert frequency == pytest.approx(1.9, abs=0.4)  # (f / 6)^2 = 0.1
+    assert below < 0.1 < 0.2 < above
+    assert replace(one, log=log, q=0.97 * q[:, None]).valid_band(0) is None, "all alike"
+
+
 def test_errors_are_of_samples_in_windows_and_the_spread_is_about_the_mean(tmp_path):
     """A body that follows a command about 3 m, its log with a gap and a sample by itself."""
     rail, rng = slider(tmp_path), np.random.default_rng(1)

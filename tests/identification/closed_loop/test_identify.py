@@ -250,6 +250,24 @@ def test_a_delay_at_its_bound_leaves_the_warning_of_a_slow_command(found):
     assert "bound" in sources
 
 
+def test_a_log_with_other_gains_is_named_with_their_ratio(leg, found):
+    """The gains of the hip stay, the others are three times and a third as large."""
+    drives, ratios = leg[0].drives, (1.0, 3.0, 1 / 3)
+    changed = [replace(d, kp=x * d.kp, kd=x * d.kd) for d, x in zip(drives, ratios, strict=True)]
+    other = replace(leg[0], drives=tuple(changed))
+    log, _ = recorded(other, np.random.default_rng(5), duration=1.0, noise=NOISE)
+    run = run_open_loop(found.fit.simulator.robot, found.fit.loops, log)
+    findings = loop_findings(replace(found, validation=(run,)), ())
+    named = {one.joints: one for one in findings if one.code == "other_gains"}
+    assert list(named) == [(joint,) for joint in log.joints[1:]]
+    for one, ratio in zip(named.values(), ratios[1:], strict=True):
+        assert abs(one.evidence["ratio"] / ratio - 1) < 0.15
+        assert one.evidence["after"] < 0.3 * one.evidence["before"]
+        assert "times that of the fit: with other gains its position error is" in one.message
+    assert not [one for one in findings if one.code == "model_bandwidth"], "the gains explain it"
+    assert not [one for one in loop_findings(found, ()) if one.code == "other_gains"]
+
+
 def test_friction_by_position_is_found_where_it_is_and_nowhere_else(leg):
     robot, rng = leg[0], np.random.default_rng(3)
     model, n = robot.model, 3
