@@ -160,9 +160,10 @@ def _segments(model: RobotModel, motion: Trajectory, every: int) -> list[Array]:
     if len(moving) == 0:
         return []
     first, stop = int(moving[0]), int(moving[-1]) + 1
-    length = ROWS * every // SEGMENTS
-    if stop - first > SEGMENTS * length:
-        starts = np.linspace(first, stop - length, SEGMENTS).astype(int)
+    windows = SEGMENTS // 2
+    length = ROWS * every // windows
+    if stop - first > windows * length:
+        starts = np.linspace(first, stop - length, windows).astype(int)
         chosen = [np.arange(start, start + length) for start in starts]
     else:
         chosen = [np.arange(first, stop)]
