@@ -302,6 +302,25 @@ class RobotModel:
         pin_model.gravity.linear = gravity
         return replace(self, pin_model=pin_model)
 
+    def with_turned_axis(self, joint: str, rotation: Array, is_carried: bool) -> "RobotModel":
+        """Return the same robot with another direction of a joint's axis.
+
+        Args:
+            joint: Its name.
+            rotation: Of the axis, in the joint's frame, shape (3, 3).
+            is_carried: Whether the links that it carries turn with its frame, as with another
+                origin of the joint; else they stay at its position 0, as with another axis.
+        """
+        pin_model = pin.Model(self.pin_model)
+        k, turn = pin_model.getJointId(joint), pin.SE3(rotation, np.zeros(3))
+        pin_model.jointPlacements[k] = pin_model.jointPlacements[k] * turn
+        if not is_carried:
+            back = turn.inverse()
+            pin_model.inertias[k] = back.act(pin_model.inertias[k])
+            for child in pin_model.children[k]:
+                pin_model.jointPlacements[child] = back * pin_model.jointPlacements[child]
+        return replace(self, pin_model=pin_model)
+
     def with_reference(self, pi: Array) -> "RobotModel":
         """Return the same robot with another reference for the torques in drive terms.
 

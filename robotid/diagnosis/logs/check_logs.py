@@ -5,7 +5,7 @@ identification unless its code is ignored.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from robotid.base.exceptions import DataError, RobotIdError
 from robotid.base.findings import Finding, by_severity, quoted, toml_key
+from robotid.base.tolerances import TINY
 from robotid.base.typing import Array
 from robotid.data.log import REPEATED, Log, Trajectory, repeated_share
 from robotid.data.signal_settings import LogUnits, SignalSettings
@@ -22,8 +23,13 @@ from robotid.diagnosis.decisions import BETTER, NOTHING, SCATTERED, SEGMENTS
 from robotid.diagnosis.logs import channels
 from robotid.diagnosis.logs.base_checks import check_base
 from robotid.diagnosis.logs.command_channels import check_commands
-from robotid.diagnosis.logs.hypotheses import Probe, smooth_motion, take_probe
-from robotid.diagnosis.logs.torque_checks import check_payload_change, check_torques, reductions_of
+from robotid.diagnosis.logs.probe import Probe, smooth_motion, take_probe
+from robotid.diagnosis.logs.torque_checks import (
+    TorqueCheck,
+    check_payload_change,
+    is_suspect,
+    reductions_of,
+)
 from robotid.diagnosis.logs.torque_delay import check_torque_delay
 from robotid.diagnosis.urdf.inertials import assumed_inertials, explained_by_assumed, rounded_angles
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
@@ -35,7 +41,11 @@ from robotid.robot.prior import prior_spread, with_assumed_inertials
 
 _ROWS = 5000  # of a log, from which its excitation is computed
 #: Findings on one torque, which another quantity in its column explains.
-_OF_A_DRIVE = ("current_for_torque", "torque_sign", "unexplained_torque", "unsigned_torque")
+_OF_A_DRIVE = ("current_for_torque", "gravity_compensated", "torque_sign", "unexplained_torque",
+               "unsigned_torque")  # fmt: skip
+_BEYOND = ("beyond_limits", "beyond_effort")
+#: Errors of channels after which no model fits the torques.
+_FIT_NO_MODEL = ("time_scale", "unsigned_torque", "constant_torque")
 _FAR = 2 * np.pi  # number in a log above which a position may be a percentage
 
 
@@ -45,17 +55,19 @@ def diagnose(
     """Check logs that are in memory; the findings have errors first."""
     # friction with an internal state is not examined here
     model = with_assumed_inertials(model.with_terms({}))
-    findings = assumed_inertials(model)
-    motions = [_examine_log(model, log, signals, findings) for log in (*fitted, *validation)]
-    first = [motion for motion, _ in motions[: len(fitted)] if motion is not None]
-    probes = [probe for _, probe in motions[: len(fitted)] if probe is not None]
+    examined = [_examine_log(model, log, signals) for log in (*fitted, *validation)]
+    _examine_torques(model, [one for one in examined if one.is_tried], signals)
+    findings = [*assumed_inertials(model), *(x for one in examined for x in one.findings)]
+    first = [one.motion for one in examined[: len(fitted)] if one.motion is not None]
+    probes = [one.probe for one in examined[: len(fitted)] if one.probe is not None]
     mapping = structural_mapping(model) if probes else None
     for k, log in enumerate(fitted):
         same = [x.name for x in fitted[:k] if np.array_equal([x.q, x.tau], [log.q, log.tau])]
         findings += [finding("repeated_log", log.name, other=same[0])] if same else []
     moving = [probe.motion for probe in probes]
     segments: list[Reduction] = []  # of the fitted motions, made if they are compared
-    for log, (motion, probe) in zip(validation, motions[len(fitted) :], strict=True):
+    for one in examined[len(fitted) :]:
+        log, motion, probe = one.log, one.motion, one.probe
         share = 0.0 if motion is None else repeated_share(first, motion)
         if share >= REPEATED:
             findings.append(finding("repeated_motion", log.name, share=share))
@@ -81,67 +93,89 @@ def findings_to_dict(findings: Sequence[Finding]) -> dict[str, Any]:
     return {"findings": [x | {"evidence": y} for x, y in zip(plain, evidence, strict=True)]}
 
 
-def _examine_log(
-    model: RobotModel, log: Log, signals: SignalSettings, findings: list[Finding]
-) -> tuple[Trajectory | None, Probe | None]:
-    """Add the findings on one log; return its smooth motion and a probe of it, or None."""
+@dataclass(eq=False)
+class _Examined:
+    """A log and what is found of it."""
+
+    log: Log
+    findings: list[Finding]
+    motion: Trajectory | None = None  # smooth
+    probe: Probe | None = None  # of a motion with torques
+    is_tried: bool = False  # whether a model may fit these torques
+
+
+def _examine_log(model: RobotModel, log: Log, signals: SignalSettings) -> _Examined:
+    """Return what the channels of one log show, and its motion."""
     name = log.name
-    findings += [finding("log_note", name, text=note) for note in log.notes]
+    findings = [finding("log_note", name, text=note) for note in log.notes]
     findings += [finding("log_assumption", name, text=text) for text in log.assumed]
-    sensors: list[Finding] = []
     if not model.is_static:  # rows of static poses may have gaps between them
-        sensors = [*channels.check_clock(log), *channels.check_channels(log, signals)]
-        findings += sensors
-    beyond = list(channels.check_limits(log, model.limits))
-    findings += beyond
+        findings += [*channels.check_clock(log), *channels.check_channels(log, signals)]
+    findings += channels.check_limits(log, model.limits)
     prismatic = [limit.name for limit in model.limits if limit.type == "prismatic"]
     findings += check_commands(log, prismatic)
     driven = [joint for joint in log.joints if joint not in model.passive]
-    has_torque = log.has_torque and bool(driven)
-    sizes = list(channels.check_torque_channels(log.select(driven))) if has_torque else []
-    findings += sizes
+    if log.has_torque and driven:
+        findings += channels.check_torque_channels(log.select(driven))
+    one = _Examined(log, findings)
     if model.free_flyer or model.constraints or model.passive:
         findings.append(finding("floating_base", name))
         findings += check_base(model, log, signals)
-        return None, None
+        return one
     if model.is_static:
-        return None, None  # the other checks need accelerations
+        return one  # the other checks need accelerations
     try:
-        motion = smooth_motion(model, log, signals)
+        one.motion = smooth_motion(model, log, signals)
     except DataError as error:
         findings.append(Finding(error.code, "error", name, str(error), log=name))
-        return None, None
-    findings += channels.check_rest(log, motion, model.layout)
+        return one
+    findings += channels.check_rest(log, one.motion, model.layout)
     if not log.has_torque:
-        return motion, None
-    probe = take_probe(model, motion)
-    if probe is None:
+        return one
+    one.probe = take_probe(model, one.motion)
+    if one.probe is None:
         findings.append(finding("no_motion", name))
-        return motion, None
-    clocks = [x for x in sensors if x.code == "time_scale"]
-    if any(x.severity == "error" for x in (*clocks, *sizes)):
-        return motion, probe  # no model fits these torques
-    torques = list(check_torques(probe, name))
-    others = [x for x in torques if x.severity == "error" and x.code not in _OF_A_DRIVE]
-    moved = {joint for x in others for joint in x.joints}
-    coarse = {joint for x in sensors if x.code == "quantised" for joint in x.joints}
-    off = [x for x in _drives_off(probe, coarse, name) if moved.isdisjoint(x.joints)]
-    findings[:] = [x for x in findings if x not in beyond or moved.isdisjoint(x.joints)]
-    named = {joint for x in (*beyond, *off) if x.severity == "error" for joint in x.joints} - moved
-    torques = [
-        x for x in torques
-        if x.code not in _OF_A_DRIVE or not x.joints or not named.issuperset(x.joints)
-    ]  # fmt: skip
-    findings += [*off, *torques]
-    if not any(x.severity == "error" for x in torques):
-        findings += check_torque_delay(model, log, signals, name)
-    return motion, probe
+        return one
+    codes = {x.code for x in findings if x.severity == "error"}
+    one.is_tried = codes.isdisjoint(_FIT_NO_MODEL)
+    return one
+
+
+def _examine_torques(model: RobotModel, logs: Sequence[_Examined], signals: SignalSettings) -> None:
+    """Add the findings on the torques of logs."""
+    # Other readings are tried for the log that is explained worst, and for those that are explained
+    # clearly worse than another; for all once one is found.
+    checks = [(one, TorqueCheck.of(one.probe)) for one in logs if one.probe is not None]
+    checks.sort(key=lambda x: float(np.log(x[1].share + TINY).mean()), reverse=True)
+    is_read = False
+    for i, (one, check) in enumerate(checks):
+        name = one.log.name
+        is_tried = i == 0 or is_read or is_suspect(check, [x for _, x in checks])
+        torques = list(check.read(name)) if is_tried else []
+        is_read |= bool(torques)
+        torques = torques or list(check.loads(name))
+        # a channel that holds another quantity explains what is found of its joint
+        others = [x for x in torques if x.severity == "error" and x.code not in _OF_A_DRIVE]
+        moved = {joint for x in others for joint in x.joints}
+        coarse = {joint for x in one.findings if x.code == "quantised" for joint in x.joints}
+        off = [x for x in _drives_off(check.probe, coarse, name) if moved.isdisjoint(x.joints)]
+        beyond = [x for x in one.findings if x.code in _BEYOND]
+        one.findings[:] = [x for x in one.findings if x not in beyond or moved.isdisjoint(x.joints)]
+        errors = [x for x in (*beyond, *off) if x.severity == "error"]
+        named = {joint for x in errors for joint in x.joints} - moved
+        torques = [
+            x for x in torques
+            if x.code not in _OF_A_DRIVE or not x.joints or not named.issuperset(x.joints)
+        ]  # fmt: skip
+        one.findings += [*off, *torques]
+        if not any(x.severity == "error" for x in torques):
+            one.findings += check_torque_delay(model, one.log, signals, name)
 
 
 def _drives_off(probe: Probe, coarse: Collection[str], name: str) -> Iterator[Finding]:
     """Yield the joints that move by the torque of others, in a part of the motion or all of it."""
     # The torque is about 0 and related to neither the URDF's torque nor the speed.
-    loads, parts = probe.loads().sum(axis=2), np.array_split(np.arange(len(probe.tau)), SEGMENTS)
+    loads, parts = probe.loads.sum(axis=2), np.array_split(np.arange(len(probe.tau)), SEGMENTS)
     tau, load, speed = (
         np.array([np.mean(x[rows] ** 2, axis=0) for rows in parts])  # (parts, n)
         for x in (probe.tau, loads, probe.v)

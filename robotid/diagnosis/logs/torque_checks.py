@@ -1,6 +1,6 @@
-"""Checks of the torques against the model: signs, columns, gravity, positions, masses and loads."""
+"""Checks of the torques against the model: other readings of the log, masses and loads."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,17 +13,8 @@ from robotid.data.log import Trajectory
 from robotid.data.units import STATIC
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import BEYOND_NOISE, NO_ERROR_OF_MASSES, ROWS, SIGNIFICANT
-from robotid.diagnosis.logs.hypotheses import (
-    CERTAIN,
-    FLOOR,
-    HINT,
-    MUCH_BETTER,
-    Explanation,
-    Probe,
-    compensated,
-    explanations,
-    own_share,
-)
+from robotid.diagnosis.logs.probe import Probe
+from robotid.diagnosis.logs.readings import CERTAIN, EXPLAINED, Best, Samples, best_readings, limbs
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Reduction, compress_segments
 from robotid.dynamics.prepared_logs import base_problem, row_mask
@@ -33,9 +24,6 @@ from robotid.robot.model import RobotModel
 from robotid.robot.prior import payload_spread, prior_spread
 
 _UNEXPLAINED = 0.25  # unexplained share of a torque's variance that is reported, not accepted
-_WRONG = 0.5  # largest unexplained share of a torque with the right sign, or over that without
-# gravity, if the torque contains gravity
-_TILT, _WRONG_TILT = 5.0, 30.0  # [deg] angles of gravity from the stated one: warning and error
 _SPREAD = 0.3  # prior standard deviation of a link's mass, relative to the URDF's
 _PRECISION = 0.05  # of a torque, model errors included
 _INDEPENDENT, _PER_SECOND = 20.0, 3.0  # independent instants of a log, per second of a short one
@@ -44,6 +32,7 @@ _WORSE = 0.25  # allowed increase of a torque's misfit over its own fit, in vari
 _OTHER_UNIT = 30.0  # a common scale of all torques farther from 1 is another unit, no gain
 _SCALES = np.logspace(-3, 3, 61)
 _ALIKE = _SCALES[2] / _SCALES[0]  # ratio below which two factors on this grid are equal
+_WRONG_TILT = 30.0  # [deg] angle of gravity from the stated one that is an error
 _LARGE = 0.08  # payload over the arm's mass that errors of the links do not explain
 _MISMATCH = 7.5  # largest sum of squared errors of the links, in standard deviations
 _NOTHING = 0.01  # of the arm's mass, the smallest change of load
@@ -51,124 +40,130 @@ _CLEARLY = 1.5  # least ratio of the misfit of other torque scales to that of a 
 _SEGMENT, _SEGMENTS = 0.4, 24  # [s] longer than the correlation of noise; most of them
 
 
-@dataclass(frozen=True)
-class _Reading:
-    """The reading of a log that explains its torques best, and the stated one."""
+@dataclass(frozen=True, eq=False)
+class TorqueCheck:
+    """The torques of one log as its model explains them, and which limbs they are of."""
 
     probe: Probe
-    stated: Explanation
-    best: Explanation
-    log: str
+    limbs: tuple[tuple[Samples, bool], ...]  # and whether other readings of them are tried
+    share: Array  # (n,), unexplained share of each torque, 1 of joints at rest
 
-    @property
-    def gain(self) -> float:
-        return self.stated.misfit - self.best.misfit
-
-    @property
-    def is_certain(self) -> bool:
-        is_explained = float(np.median(self.best.share)) < _UNEXPLAINED
-        return is_explained and self.gain > CERTAIN
-
-    @property
-    def joints(self) -> list[str]:
-        return [self.probe.model.joints[j] for j in self.best.joints]
-
-
-def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
-    """Yield the faults of signs, columns, gravity or URDF that keep the torques from fitting."""
-    # Only the best reading is reported; if it is the stated one, the URDF's masses are checked.
-    stated, loaded, others = explanations(probe)
-    best = min(others, key=lambda e: e.misfit)
-    if best.kind not in _SIGNS and loaded.misfit < best.misfit:
-        best = stated  # a load explains the torques better
-    make = _FINDINGS.get(best.kind)
-    findings = list(make(_Reading(probe, stated, best, name))) if make else []
-    for one in findings:
-        # a fault that a load on the last link explains as well is only a warning
-        yield replace(one, severity="warning") if _is_excused(best, loaded) else one
-    if not findings:
-        yield from _check_loads(probe, loaded.share, name)
+    @classmethod
+    def of(cls, probe: Probe) -> "TorqueCheck":
+        """Return the check of a log."""
         # the friction of a joint at rest has any value: nothing contradicts its torque
-        still = np.ptp(probe.motion.q, axis=0) < STATIC
-        yield from _unexplained(probe, np.where(still, 0.0, loaded.share), name)
+        moves = np.ptp(probe.motion.q, axis=0) >= STATIC
+        groups = [(rows[moves[rows]], is_tried) for rows, is_tried in limbs(probe.model)]
+        samples = tuple((Samples.of(probe, rows), x) for rows, x in groups if len(rows))
+        share = np.ones(len(moves))
+        for one, _ in samples:
+            share[one.motion.rows] = np.minimum(one.share, 1.0)
+        return cls(probe, samples, share)
+
+    def read(self, name: str) -> Iterator[Finding]:
+        """Yield the other readings that explain the torques."""
+        for samples, is_tried in self.limbs:
+            if is_tried:
+                yield from _findings(samples, list(best_readings(samples)), name)
+
+    def loads(self, name: str) -> Iterator[Finding]:
+        """Yield another scale, a load or another robot, and torques that nothing explains."""
+        yield from _check_loads(self.probe, self.share, name)
+        rows = np.concatenate([samples.motion.rows for samples, _ in self.limbs])
+        bad = [j for j in rows if self.share[j] > _UNEXPLAINED]
+        if 2 * len(bad) > len(self.share):
+            yield finding(
+                "unexplained_torque", name, what="robot", joints=len(bad), of=len(self.share),
+                share=float(np.median(self.share)),
+            )  # fmt: skip
+            return
+        for j in bad:
+            yield finding(
+                "unexplained_torque", name, self.probe.model.joints[j], what="joint",
+                share=self.share[j],
+            )  # fmt: skip
 
 
-def _sign(reading: _Reading) -> Iterator[Finding]:
-    code = reading.best.kind
-    for j, joint in zip(reading.best.joints, reading.joints, strict=True):
-        before, after = reading.stated.share[j], reading.best.share[j]
-        figures = {"unexplained": before, "unexplained_if_negated": after}
-        if code == "unsigned_torque":
-            figures = {"unexplained": before, "unexplained_with_signs": after}
-        if after <= _UNEXPLAINED and (before >= _WRONG or code == "unsigned_torque"):
-            yield finding(code, reading.log, joint, kind="one", cure="one", **figures)
+def is_suspect(check: TorqueCheck, others: Sequence[TorqueCheck]) -> bool:
+    """Return whether a log explains a torque clearly worse than another log of the robot."""
+    least = np.min([one.share for one in others], axis=0)
+    floor = TINY + least
+    return bool((check.share > np.exp(CERTAIN) * floor).any())
 
 
-def _moved(reading: _Reading) -> Iterator[Finding]:
-    """Yield the error that columns contain other quantities than stated."""
-    if not reading.is_certain:
-        return
-    before, best, joints = reading.stated.share, reading.best, reading.probe.model.joints
-    words: dict[str, float | str] = {}
-    if best.kind == "torque_order":
-        pairs = [(joints[j], joints[int(best.values[j])]) for j in best.joints]
-        words["owners"] = ", ".join(f"tau_{a} is the torque of {b}" for a, b in pairs)
-    elif best.kind not in ("joint_order", "position_order"):
-        worst = int(np.argmax(before - best.share))
-        words = {"worst": joints[worst], "before": before[worst], "after": best.share[worst]}
-        words |= {"what": "log", "cure": "log"} | dict(zip(["offset"], best.values, strict=False))
-    yield finding(
-        best.kind, reading.log, reading.joints, gain=reading.gain, unexplained=before.max(),
-        unexplained_so_read=best.share.max(), **words,
-    )  # fmt: skip
+def _findings(samples: Samples, found: Sequence[Best], log: str) -> Iterator[Finding]:
+    """Yield the findings of readings that explain the torques together."""
+    rows, joints = samples.motion.rows.tolist(), samples.motion.model.joints
+    final = found[-1].after if found else np.zeros(len(rows))
+    exchanged: dict[str, list[Best]] = {}
+    for one in found:
+        reading = one.reading
+        concerned = np.isin(rows, reading.joints) | (not reading.joints)
+        is_unit = reading.code == "current_for_torque" and not reading.joints
+        if is_unit or np.median(final[concerned]) > EXPLAINED:
+            continue  # a unit of all torques shows in the masses
+        if reading.code in _ORDERS:
+            exchanged.setdefault(reading.code, []).append(one)
+        elif reading.code in ("torque_sign", "unsigned_torque"):
+            each = [j for j in reading.joints or rows if one.before[rows.index(j)] > 0.0]
+            for j in each:
+                before, after = (x[rows.index(j)] for x in (one.before, one.after))
+                yield finding(
+                    reading.code, log, joints[j], kind="one", cure="one", unexplained=before,
+                    unexplained_if_negated=after, unexplained_with_signs=after,
+                )  # fmt: skip
+        else:
+            yield _finding(samples, one, log)
+    for code, pairs in exchanged.items():
+        order = np.arange(len(joints))
+        for one in pairs:
+            i, k = one.reading.joints
+            order[[i, k]] = order[[k, i]]
+        moved = np.flatnonzero(order != np.arange(len(joints)))
+        owners = [f"tau_{joints[order[j]]} is the torque of {joints[j]}" for j in moved]
+        yield finding(
+            code, log, [joints[j] for j in moved], owners=", ".join(owners),
+            gain=sum(one.gain for one in pairs), unexplained=pairs[0].before.max(),
+            unexplained_so_read=pairs[-1].after.max(),
+        )  # fmt: skip
 
 
-def _gravity(reading: _Reading) -> Iterator[Finding]:
-    g, believed, gain = np.array(reading.best.values), reading.probe.gravity, reading.gain
-    size = float(np.linalg.norm(believed))
-    if not g.any():
-        if size > 0 and reading.is_certain and not _holds_gravity(reading.probe):
-            yield finding("gravity_compensated", reading.log, gain=gain)
-        return
-    cosine = float(g @ believed) / (float(np.linalg.norm(g)) * size) if size > 0 else 0.0
-    angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    is_wrong = angle > _WRONG_TILT and reading.is_certain
-    if not is_wrong and (angle < _TILT or gain < HINT):
-        return
-    best, stated = (", ".join(f"{x:.2f}" for x in vector) for vector in (g, believed))
-    evidence = {"angle_deg": angle, "x": g[0], "y": g[1], "z": g[2], "gain": gain}
-    yield finding(
-        "gravity", reading.log, severity="error" if is_wrong else "warning", what="log",
-        cure="log", best=best, stated=stated, **evidence,
-    )  # fmt: skip
+_ORDERS = ("torque_order", "position_order", "joint_order")
 
 
-_SIGNS = ("torque_sign", "unsigned_torque")
-_MOVED = ("torque_order", "joint_order", "position_order", "joint_axis", "position_sign",
-          "position_offset")  # fmt: skip
-_FINDINGS: dict[str, Callable[[_Reading], Iterator[Finding]]] = {
-    **dict.fromkeys(_SIGNS, _sign), "gravity": _gravity,
-    **dict.fromkeys(_MOVED, _moved),
-}  # fmt: skip
-
-
-def _is_excused(best: Explanation, loaded: Explanation) -> bool:
-    if best.kind in _SIGNS:
-        j = list(best.joints)
-        enough = np.minimum(_UNEXPLAINED, MUCH_BETTER * (best.share[j] + FLOOR))
-        return bool((loaded.share[j] < enough).all())
-    return loaded.misfit - best.misfit < CERTAIN
-
-
-def _unexplained(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
-    """Yield torques with a large unexplained share; one finding if these are most of them."""
-    code, bad = "unexplained_torque", np.flatnonzero(share > _UNEXPLAINED)
-    if 2 * len(bad) > len(share):
-        middle = float(np.median(share))
-        yield finding(code, name, what="robot", joints=len(bad), of=len(share), share=middle)
-        return
-    for j in bad:
-        yield finding(code, name, probe.model.joints[j], what="joint", share=share[j])
+def _finding(samples: Samples, one: Best, log: str) -> Finding:
+    """Return the finding of a reading."""
+    model, reading = samples.motion.model, one.reading
+    names = [model.joints[j] for j in reading.joints]
+    worst = int(np.argmax(one.before - one.after))
+    others = [r for r in one.alike if r.joints]
+    values: dict[str, float | str] = {
+        "worst": model.joints[samples.motion.rows[worst]], "before": one.before[worst],
+        "after": one.after[worst], "gain": one.gain, "what": "log", "cure": "log",
+        "also": bool(others), "others": listed(
+            f"{r.code} of {listed(model.joints[j] for j in r.joints)}" for r in others
+        ),
+    }  # fmt: skip
+    if reading.code == "gravity":
+        best, stated = (
+            np.array(x.motion.model.pin_model.gravity.linear)
+            for x in (reading.of(samples), samples)
+        )
+        lengths = np.linalg.norm(best) * np.linalg.norm(stated)
+        angle = float(np.degrees(np.arccos(np.clip(best @ stated / max(lengths, TINY), -1.0, 1.0))))
+        shown = (", ".join(f"{x:.2f}" for x in vector) for vector in (best, stated))
+        values |= dict(zip(("best", "stated"), shown, strict=True)) | {"angle_deg": angle}
+        values |= dict(zip("xyz", best.tolist(), strict=True))
+        values["severity"] = "error" if angle > _WRONG_TILT else "warning"
+    elif reading.code == "position_offset":
+        values["offset"] = reading.values[0]
+    elif reading.code == "time_scale":
+        values["speed"] = float(np.exp(-reading.values[0]))
+    elif reading.code == "current_for_torque":
+        values["factor"] = float(np.exp(-reading.values[0]))
+    elif reading.code == "gravity_compensated":
+        values["what"] = "joint" if names else "robot"
+    return finding(reading.code, log, names, **values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,19 +212,19 @@ class LoadModel:
         return np.concatenate([rows.reshape(T, n * (c + 1), c + 1), prior], axis=1)
 
 
-def load_model(probe: Probe, share: Array, level: Array | None = None) -> LoadModel:
-    """Return the load model of a motion: share (n,), level (n,)."""
+def load_model(probe: Probe, share: Array) -> LoadModel:
+    """Return the load model of a motion: share (n,)."""
     N, n = probe.tau.shape
     duration = float(np.ptp(probe.motion.t[probe.rows]))
     independent = min(_INDEPENDENT, _PER_SECOND * duration)
-    links = probe.loads()
+    links = probe.loads
     bodies = links.shape[2]
     X = np.concatenate([links, probe.last_body, probe.tau[:, :, None]], axis=2)
-    level = probe.tau.std(axis=0) if level is None else level
+    level = probe.tau.std(axis=0)
     used = (level > TINY * np.abs(probe.tau).max()) & (share < _UNEXPLAINED)
     R = np.zeros((n, bodies + 5, bodies + 5))
     for j in np.flatnonzero(used).tolist():
-        drive = np.delete(probe.drives[:, j], 4, axis=1)
+        drive = probe.drives[:, j]
         length = np.linalg.norm(drive, axis=0)
         U, s, _ = np.linalg.svd(drive / np.where(length > 0, length, 1.0), full_matrices=False)
         Q = U[:, s > TINY * s[0]]
@@ -254,8 +249,8 @@ def _check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
         if len(other) and model.is_this_robot(scale):
             yield from _scaled(probe, scale, _needed(model, scale, other), name)
             return
-        if _holds_no_gravity(probe):
-            yield finding("gravity_compensated", name)
+        if _is_compensated(probe):
+            yield finding("gravity_compensated", name, what="robot")
             return
         if len(other) or _error_of_links(theta) > _MISMATCH:
             factors = dict(zip(probe.model.layout.bodies, theta[:bodies].tolist(), strict=True))
@@ -265,21 +260,14 @@ def _check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
     yield from _payload(probe, theta[bodies:], float(error[bodies]), name)
 
 
-def _holds_no_gravity(probe: Probe) -> bool:
-    """Return whether the torques fit the URDF if its gravity is added, and not as logged."""
-    # Both tests use the level of the logged torques, and no load on the last link.
-    if not probe.gravity.any() or _holds_gravity(probe):
+def _is_compensated(probe: Probe) -> bool:
+    """Return whether torques fit the URDF's masses only with the URDF's gravity added."""
+    still = np.zeros_like(probe.v)
+    weight = replace(probe, v=still, a=still).loads.sum(axis=2)
+    if not weight.any():
         return False
-    level, ones = probe.tau.std(axis=0), np.ones(probe.tau.shape[1])
-    readings = (probe, own_share(probe)), compensated(probe)
-    logged, corrected = (load_model(*x, level).is_this_robot(ones) for x in readings)
-    return corrected and not logged
-
-
-def _holds_gravity(probe: Probe) -> bool:
-    """Return whether the torque of a joint contains its gravity torque by the URDF."""
-    share, without = own_share(probe), own_share(probe, np.zeros(3))
-    return bool(((share + FLOOR < _WRONG * (without + FLOOR)) & (without < 1.0)).any())
+    whole = TorqueCheck.of(replace(probe, tau=probe.tau + weight))
+    return load_model(whole.probe, whole.share).is_this_robot(np.ones(len(whole.share)))
 
 
 def _error_of_links(theta: Array) -> float:
@@ -322,11 +310,11 @@ def _scaled(probe: Probe, scale: Array, other: Array, name: str) -> Iterator[Fin
         is_unit = is_all and abs(np.log(factor)) > np.log(_OTHER_UNIT)
         yield finding(
             code, name, () if is_all else joints, severity="error" if is_unit else "warning",
-            factor=factor, joints=len(other), joint=listed(joints),
+            factor=factor, joints=len(other), joint=listed(joints), also=False,
         )  # fmt: skip
         return
     for joint, factor in zip(joints, factors, strict=True):
-        yield finding(code, name, joint, factor=factor)
+        yield finding(code, name, joint, factor=factor, also=False)
 
 
 def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Finding]:

@@ -19,7 +19,7 @@ from robotid.data.units import AT_REST, LARGEST_LAG
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import BEYOND_NOISE, DIFFERS, FEWEST, LEAST_SHARE, ROWS, SEGMENTS
 from robotid.diagnosis.logs.channels import MOVING, distance
-from robotid.diagnosis.logs.hypotheses import coupled_columns, smooth_motion
+from robotid.diagnosis.logs.probe import coupled_columns, smooth_motion
 from robotid.dynamics.rows import inertial_rows
 from robotid.robot.model import RobotModel
 

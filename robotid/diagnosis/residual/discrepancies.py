@@ -127,7 +127,12 @@ class _Alteration:
                 "named": f"q_{joint}" if joint else "every position",
             },
             "torque_scale": {"factor": 1 + x[0], "what": sense, "cure": sense},
-            "time_scale": {"factor": 1 + x[0], "speed": np.sqrt(max(1 + x[0], 0.0))},
+            "time_scale": {
+                "factor": 1 + x[0],
+                "speed": np.sqrt(max(1 + x[0], 0.0)),
+                "what": "residual",
+                "cure": "residual",
+            },
             "joint_origin": {"named": joint or "a joint"},
         }
         more, applied = values.get(self.reading.code, {}), self.reading.applied

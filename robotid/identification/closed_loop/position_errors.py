@@ -75,30 +75,29 @@ class PositionEvaluation:
             return np.ones(len(self.rmse), dtype=bool)
         return np.asarray(np.ptp(self.log.q_ref, axis=0) > 0)
 
-    def valid_band(self, j: int) -> tuple[float, float, float] | None:
-        """Return the frequency above which all errors of a joint are large, errors to it and above.
+    def valid_band(self, j: int) -> dict[str, float] | None:
+        """Return the frequency above which all errors of a joint are large, and its errors.
 
-        Errors are relative to the motion at frequencies of the command [-]; None without this.
+        Errors below and above it are relative to the motion, at frequencies of the command [-].
         """
         from scipy.ndimage import median_filter
         from scipy.signal import welch
 
         longest = max(cut_windows(self.log, np.inf, 0.0), key=lambda w: w.stop - w.first)
-        signals = np.asarray(self.log.q_ref)[:, j], self.log.q[:, j], (self.log.q - self.q)[:, j]
-        n = min(longest.stop - longest.first, round(SECONDS / longest.dt))
-        f, powers = welch(
-            np.stack(signals)[:, longest.counted], 1 / longest.dt, nperseg=n, detrend="linear"
-        )
+        q, q_ref = self.log.q, np.asarray(self.log.q_ref)
+        signals = np.stack([q_ref, q, q - self.q])[:, longest.counted, j]
+        n = min(signals.shape[1], round(SECONDS / longest.dt))
+        f, powers = welch(signals, 1 / longest.dt, nperseg=n, detrend="linear")
         used = (powers[0] > EXCITED * powers[0].max()) & (f > 0)
-        f, q, error = f[used], powers[1, used], powers[2, used]
-        share = median_filter(np.sqrt(error / q), size=2 * SCATTERED - 1, mode="nearest")
+        f, (_, motion, error) = f[used], powers[:, used]
+        share = median_filter(np.sqrt(error / motion), size=2 * SCATTERED - 1, mode="nearest")
         k = 1 + int(np.flatnonzero(share <= DIFFERS).max(initial=-1))
         if not SCATTERED <= k <= len(f) - SCATTERED:
             return None
-        below, above = (
-            float(np.sqrt(error[x].sum() / q[x].sum())) for x in (slice(k), slice(k, None))
-        )
-        return (float(f[k]), below, above) if below < BETTER * above else None
+        below = float(np.sqrt(error[:k].sum() / motion[:k].sum()))
+        above = float(np.sqrt(error[k:].sum() / motion[k:].sum()))
+        figures = {"frequency": float(f[k]), "below": below, "above": above}
+        return figures if below < BETTER * above else None
 
     def to_dict(self, name: str = "estimate") -> dict[str, Any]:
         """Return the log and its errors as plain values, as result.json has them."""

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
-from itertools import product
+from itertools import compress, product
 
 import numpy as np
 
@@ -169,46 +169,41 @@ def fit_loops(
     return Fitted(simulator, estimate, initialised.plain, *others)
 
 
-@dataclass(frozen=True, eq=False)
-class OtherGains:
-    """Gains with which one log agrees with a fit of others; arrays of shape (k,)."""
-
-    ratio: Array  # of kp to that of the fit [-]
-    std_error: Array  # of the ratio [-]
-    before: Array  # error of simulated positions with the gains of the fit [% of RMS motion]
-    after: Array  # ... and with the other ones
-
-
 def fit_one_log(fitted: Fitted, log: Log) -> Loops:
     """Return the loops with drives and gains, but no bodies, fitted to one log."""
-    simulator, theta = fitted.simulator, fitted.estimate.theta
-    free = [k for k, x in enumerate(simulator.free_parameters) if x.what != "body"]
-    alone = replace(
-        simulator, windows=_few(cut_windows(log, _WINDOW, _LEAD)), base=fitted.loops,
-        free_parameters=tuple(simulator.free_parameters[k] for k in free),
-    )  # fmt: skip
-    return alone.loops(OutputError().minimise(alone, theta[free]))
+    free = [x.what != "body" for x in fitted.simulator.free_parameters]
+    of_drives = tuple(compress(fitted.simulator.free_parameters, free))
+    windows = _few(cut_windows(log, _WINDOW, _LEAD))
+    alone = replace(fitted.simulator, windows=windows, base=fitted.loops)
+    alone = replace(alone, free_parameters=of_drives)
+    return alone.loops(OutputError().minimise(alone, fitted.estimate.theta[free]))
 
 
-def fit_gains(simulator: LoopSimulator, loops: Loops, log: Log, joints: Array) -> OtherGains | None:
-    """Return the gains of joints (k,) fitted to one log, else as ``loops``; None if it fails."""
+def fit_gains(
+    simulator: LoopSimulator, loops: Loops, log: Log, joints: Array
+) -> dict[int, dict[str, float]]:
+    """Return the gains of joints (k,) fitted to one log, all else unchanged; {} if it fails.
+
+    The figures of a joint are the ratio of kp to that of the loops with its standard error, and the
+    errors of simulated positions before and after [% of RMS motion].
+    """
     windows, own = _few(cut_windows(log, _WINDOW, _LEAD)), np.stack([loops.kp, loops.kd])[:, joints]
-    free = [
-        FreeParameter(f"{w} {j}", w, (j,), 0.0, np.inf, 0.0) for w in ("kp", "kd") for j in joints
-    ]
-    alone = LoopSimulator(simulator.robot, windows, loops, tuple(free))
-    # where kd grows with the root of kp, the damping ratio stays the same
-    starts = [(own * [[x], [np.sqrt(x)]]).reshape(-1) for x in 2.0 ** np.arange(-3, 4)]
-    errors = []
-    for start in starts:
+    pairs = [(what, int(j)) for what in ("kp", "kd") for j in joints]
+    free = tuple(FreeParameter(f"{w} {j}", w, (j,), 0.0, np.inf, 0.0) for w, j in pairs)
+    alone, errors = LoopSimulator(simulator.robot, windows, loops, free), []
+    for factor in 2.0 ** np.arange(-3, 4) if pairs else ():
+        # if kd grows with the root of kp, the damping ratio stays the same
+        start = (own * [[factor], [np.sqrt(factor)]]).reshape(-1)
         with suppress(NotConvergedError):
-            errors.append((_errors_of(alone, alone.loops(start))[joints], start))
+            errors.append((_errors_of(alone, alone.loops(start))[joints].sum(), start))
     if not errors:
-        return None
-    estimate = OutputError(whitens=False).fit(alone, min(errors, key=lambda x: x[0].sum())[1])
-    ratio, error = (x[: len(joints)] / own[0] for x in (estimate.theta, estimate.std_error))
+        return {}
+    estimate = OutputError(whitens=False).fit(alone, min(errors, key=lambda x: float(x[0]))[1])
     before, after = (_errors_of(alone, x)[joints] for x in (loops, alone.loops(estimate.theta)))
-    return OtherGains(ratio, error, before, after)
+    k, names = len(joints), ("ratio", "std_error", "before", "after")
+    figures = [estimate.theta[:k] / own[0], estimate.std_error[:k] / own[0], before, after]
+    rows = np.array(figures).T.tolist()
+    return {j: dict(zip(names, row, strict=True)) for (_, j), row in zip(pairs, rows, strict=False)}
 
 
 @dataclass(frozen=True, eq=False)

@@ -75,9 +75,9 @@ def test_a_model_without_a_spring_holds_up_to_some_frequency(arm):
     q, simulated = (np.fft.irfft(np.fft.rfft(q_ref) / H) for H in (elastic, rigid))
     q += 1e-4 * rng.standard_normal(len(q))
     log = Log(t, q[:, None], 0 * q[:, None], arm.joints, q_ref=q_ref[:, None], has_torque=False)
-    frequency, below, above = replace(one, log=log, q=simulated[:, None]).valid_band(0)
-    assert frequency == pytest.approx(1.9, abs=0.4)  # (f / 6)^2 = 0.1
-    assert below < 0.1 < 0.2 < above
+    band = replace(one, log=log, q=simulated[:, None]).valid_band(0)
+    assert band["frequency"] == pytest.approx(1.9, abs=0.4)  # (f / 6)^2 = 0.1
+    assert band["below"] < 0.1 < 0.2 < band["above"]
     assert replace(one, log=log, q=0.97 * q[:, None]).valid_band(0) is None, "all alike"
 
 

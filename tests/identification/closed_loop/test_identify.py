@@ -264,7 +264,6 @@ def test_a_log_with_other_gains_is_named_with_their_ratio(leg, found):
         assert abs(one.evidence["ratio"] / ratio - 1) < 0.15
         assert one.evidence["after"] < 0.3 * one.evidence["before"]
         assert "times that of the fit: with other gains its position error is" in one.message
-    assert not [one for one in findings if one.code == "model_bandwidth"], "the gains explain it"
     assert not [one for one in loop_findings(found, ()) if one.code == "other_gains"]
 
 

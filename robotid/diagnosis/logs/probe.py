@@ -1,0 +1,109 @@
+"""A few hundred instants of a log, with separate parts of the model's torque."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from robotid.base.typing import Array
+from robotid.data.log import Log, Trajectory
+from robotid.data.signal_settings import SignalSettings
+from robotid.data.signals import process, resolve, unwrap
+from robotid.data.units import AT_REST
+from robotid.dynamics.rows import drive_values, friction_directions, friction_speeds, inertial_rows
+from robotid.robot.model import RobotModel
+
+_MARGIN = 0.15  # [s] rows closer to the end of a segment are not used: the filter has not settled
+_SLOW = 0.05  # largest speed of the unknown sign of friction of a slow joint, over its largest
+
+
+@dataclass(frozen=True, eq=False)
+class Probe:
+    """The parts of the model's torque at N instants, linear in masses and gravity."""
+
+    # Parts are computed at first use: whole regressors have 0.3 MB per instant for 60 joints.
+
+    model: RobotModel
+    motion: Trajectory  # The smooth motion that contains the instants
+    rows: Array  # (N,), the instants as rows of the motion
+    q: Array  # (N, n), joint positions [rad or m]
+    v: Array  # (N, n), velocities
+    a: Array  # (N, n), accelerations
+    tau: Array  # (N, n), torques [N m or N]
+
+    @classmethod
+    def of(cls, model: RobotModel, motion: Trajectory, rows: Array) -> "Probe":
+        """Return the probe at rows of a motion."""
+        at = (x[rows] for x in (motion.q, motion.v, motion.a, motion.tau))
+        return cls(model, motion, rows, *at)
+
+    @cached_property
+    def _places(self) -> tuple[Array, Array]:
+        """Rows and bodies of the carried columns, one entry for ten columns."""
+        rows, bodies = np.nonzero(self.model.support[:, : self.model.layout.n_inertial : 10])
+        return rows, bodies
+
+    @cached_property
+    def _ten(self) -> Array:
+        """Columns of the ten parameters of each carried body, shape (N, bodies carried, 10)."""
+        columns = inertial_rows(self.model, self.q, self.v, self.a).values.T
+        return columns.reshape(len(columns), -1, 10)
+
+    @cached_property
+    def last_body(self) -> Array:
+        """Columns of mass and first moments of the last body, shape (N, n, 4)."""
+        rows, bodies = self._places
+        is_last = bodies == self.model.layout.n_inertial // 10 - 1
+        last = np.zeros((*self.v.shape, 4))
+        last[:, rows[is_last]] = self._ten[:, is_last, :4]
+        return last
+
+    @cached_property
+    def loads(self) -> Array:
+        """Torque of each link by the URDF, shape (N, n, bodies)."""
+        pi = self.model.standard_parameters()[: self.model.layout.n_inertial].reshape(-1, 10)
+        rows, bodies = self._places
+        loads = np.zeros((*self.v.shape, len(pi)))
+        loads[:, rows, bodies] = np.einsum("kbi,bi->kb", self._ten, pi[bodies])
+        return loads
+
+    @cached_property
+    def drives(self) -> Array:
+        """Columns of the drives, shape (N, n, 4 + k)."""
+        return drive_columns(self.model, self.q, self.v, self.a)
+
+
+def drive_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
+    """Return the columns 1, a, v and sign v of the drives, and of coupled drives, (N, n, 4 + k)."""
+    least = AT_REST * model.layout.drive_speeds[: v.shape[1]]
+    still = np.minimum(least, _SLOW * np.abs(v).max(axis=0))
+    own = [np.ones_like(v), a, v, np.tanh(v / np.where(still > 0, still, least))]
+    return np.concatenate([np.stack(own, axis=2), coupled_columns(model, q, v, a)], axis=2)
+
+
+def coupled_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
+    """Return the regressor's columns of coupled drives, shape (N, n, k)."""
+    layout, coupled = model.layout, np.flatnonzero(model.layout.is_coupled)
+    if not len(coupled):
+        return np.empty((*v.shape, 0))
+    values = drive_values(layout, q, v, a, friction_directions(layout, v, None))
+    return np.asarray(layout.drive_loads[:, coupled] * values[coupled].T[:, None])
+
+
+def smooth_motion(model: RobotModel, log: Log, settings: SignalSettings) -> Trajectory:
+    """Return the motion of a log with velocities and accelerations derived from its positions."""
+    log = unwrap(log, np.array([joint.turns_freely for joint in model.limits]))
+    settings = replace(settings, velocity="differentiated", acceleration="differentiated")
+    return process(log, resolve(log, settings), friction_speeds(model.layout))
+
+
+def take_probe(model: RobotModel, motion: Trajectory, *, samples: int = 500) -> Probe | None:
+    """Return a probe of a motion, None if the motion is too small for any check."""
+    parts = np.split(motion.t, np.flatnonzero(np.diff(motion.segment)) + 1)
+    inner = np.concatenate([(t >= t[0] + _MARGIN) & (t <= t[-1] - _MARGIN) for t in parts])
+    slow = AT_REST * model.layout.drive_speeds[: len(model.joints)]
+    rows = np.flatnonzero((np.abs(motion.v) > slow).any(axis=1) & inner)
+    if len(rows) < 50:
+        return None
+    chosen = np.unique(np.linspace(0, len(rows) - 1, samples).astype(int))
+    return Probe.of(model, motion, rows[chosen])

@@ -1,0 +1,471 @@
+"""Readings of the torques of a log: another meaning of its channels that explains them, if any.
+
+A reading changes channels of the log or numbers of the URDF: a sign, an order, a zero, an axis, a
+clock, a gain, gravity. The torques of a few hundred instants are predicted under each reading by
+bodies near the URDF's and by drives, and readings are compared by
+
+    misfit = sum over joints of log(squared residual / squared variation of the torque),
+
+minus twice the logarithm of the likelihood per instant if the noise of each joint is unknown. The
+bodies may differ from the URDF's by ten times their size: no error of masses is another reading.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache, partial
+from itertools import combinations, pairwise, product
+from typing import Any
+
+import numpy as np
+
+from robotid.base.typing import Array
+from robotid.diagnosis.logs.channels import ZERO
+from robotid.diagnosis.logs.probe import Probe, drive_columns
+from robotid.dynamics.rows import inertial_rows, joint_constants
+from robotid.robot.model import GRAVITY, RobotModel
+from robotid.robot.prior import prior_spread
+
+CERTAIN = 2.0  # decrease of the misfit from which another reading is certain
+EXPLAINED = 0.1  # unexplained share of a torque below which a reading explains it
+_POOR = 0.0005  # unexplained share of a torque from which other readings are tried ...
+_GROSS = 0.05  # ... and from which other directions of the axes are tried
+_FLOOR = 1e-5  # an unexplained share below this is rounding
+_LOOSE = 10.0  # prior deviation of the bodies, in sizes of the URDF's
+_FEW = 48  # instants with which the readings are chosen that are tried with all
+_SEGMENTS = 8  # of the log that are held out in turn
+_BODIES = 20  # of a limb, at most
+_TRIED = 5  # readings that are tried with all instants
+_TILT = 0.35  # tangent of the angle of a base that is not level
+_OFFSET = 0.4  # [rad] of a zero position
+_DRIVE = 4  # columns of a drive: offset, armature, viscous and Coulomb friction
+
+
+def limbs(model: RobotModel) -> list[tuple[Array, bool]]:
+    """Return groups of joints that are explained together, and whether other readings are tried."""
+    # Those that carry few bodies, connected by these bodies; last those that carry more.
+    from scipy.sparse.csgraph import connected_components
+
+    carries = model.support[:, : model.layout.n_inertial : 10]
+    is_few = carries.sum(axis=1) <= _BODIES
+    small = np.flatnonzero(is_few)
+    count, label = connected_components(carries[small] @ carries[small].T)
+    groups = [(small[label == k], True) for k in range(count)]
+    return groups + ([] if is_few.all() else [(np.flatnonzero(~is_few), False)])
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """N instants of a motion and torque columns, and what a robot predicts of a limb's joints."""
+
+    model: RobotModel
+    q: Array  # (N, n) [rad or m]
+    v: Array  # (N, n)
+    a: Array  # (N, n)
+    tau: Array  # (N, n) [N m or N], columns as logged
+    size: Array  # (n,), squared variation of each of them, 0 if constant
+    rows: Array  # (m,), the limb's joints
+    spread: Array  # (p,), prior deviations of the bodies
+    gravity: Array  # (n,), factor of the torque of gravity on each joint
+    inertia: Array  # (n,), factor of the torque of inertia on each joint
+    subtracted: float = 0.0  # factor of the URDF's gravity that was subtracted from the torques
+    segments: int = _SEGMENTS  # of the instants
+
+    @cached_property
+    def products(self) -> Array:
+        """P^T P of each segment and joint: P = [bodies, drive, URDF's torque, columns of tau]."""
+        X, pi = self.inertial(self.v, self.a), self.model.standard_parameters()[self.moved]
+        urdf = X @ pi
+        is_changed = (self.gravity != 1.0).any() or (self.inertia != 1.0).any()
+        if is_changed or self.subtracted:
+            weight = self.inertial(0.0 * self.v, 0.0 * self.a)
+            gravity, inertia = (x[self.rows, None] for x in (self.gravity, self.inertia))
+            X = inertia * (X - weight) + gravity * weight
+            urdf = X @ pi - self.subtracted * (weight @ pi)
+        drive = drive_columns(self.model, self.q, self.v, self.a)[:, self.rows]
+        level = np.sqrt(np.mean(self.tau**2, axis=0).max())
+        drive *= level / (np.sqrt(np.mean(drive**2, axis=0)) + _FLOOR)
+        coupled, drive = drive[..., _DRIVE:], drive[..., :_DRIVE]
+        logged = np.repeat(self.tau[:, None], len(self.rows), axis=1)
+        columns = [X * self.spread[self.moved], coupled, drive, urdf[..., None], logged]
+        P = np.concatenate(columns, axis=2).swapaxes(0, 1)
+        edges = np.linspace(0, len(self.tau), self.segments + 1).astype(int).tolist()
+        parts = [P[:, i:k] for i, k in pairwise(edges)]
+        return np.array([part.swapaxes(1, 2) @ part for part in parts])  # (K, m, c, c)
+
+    @cached_property
+    def moved(self) -> Array:
+        """Places of the parameters of bodies that the limb moves."""
+        moves = self.model.support[self.rows, : len(self.spread)]
+        return np.flatnonzero(moves.any(axis=0))
+
+    def inertial(self, v: Array, a: Array) -> Array:
+        """Return the columns of the limb's bodies, shape (N, m, p)."""
+        rows, bodies = np.nonzero(self.model.support[:, : len(self.spread) : 10])
+        row = np.full(v.shape[1], -1)
+        row[self.rows] = np.arange(len(self.rows))
+        own = row[rows] >= 0
+        values = inertial_rows(self.model, self.q, v, a).values.T.reshape(len(v), -1, 10)
+        columns = np.zeros((len(v), len(self.rows), len(self.spread) // 10, 10))
+        columns[:, row[rows[own]], bodies[own]] = values[:, own]
+        return columns.reshape(*columns.shape[:2], -1)[..., self.moved]
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """A motion, and the columns that are read as the torques of its joints."""
+
+    motion: _Motion
+    order: Array  # (n,), torque column of each joint
+    sign: Array  # (n,), of the torque of each joint
+    gain: Array  # (n,), torque as logged over the torque of the joint
+
+    @classmethod
+    def of(cls, probe: Probe, rows: Array) -> "Samples":
+        """Return the samples of a log as it is."""
+        one, model = np.ones(probe.tau.shape[1]), probe.model
+        spread = prior_spread(model, np.ones((3, model.n_rows)), 1)[: model.layout.n_inertial]
+        at = probe.q, probe.v, probe.a, probe.tau, _variation(probe.tau)
+        motion = _Motion(model, *at, rows, _LOOSE * spread, one, one)
+        return cls(motion, np.arange(len(one)), one, one)
+
+    def few(self) -> "Samples":
+        """Return some of the instants, in one segment."""
+        step = max(1, len(self.motion.q) // _FEW)
+        some = {key: getattr(self.motion, key)[::step] for key in ("q", "v", "a", "tau")}
+        return self.changed(segments=1, size=_variation(some["tau"]), **some)
+
+    def changed(self, **values: Any) -> "Samples":  # noqa: ANN401
+        """Return the samples with other values of the motion or of the robot."""
+        return replace(self, motion=replace(self.motion, **values))
+
+    @property
+    def unsigned(self) -> list[int]:
+        """The joints of the limb with torques that vary and are never negative."""
+        m = self.motion
+        low, high = m.tau.min(axis=0), m.tau.max(axis=0)
+        is_unsigned = (m.size > 0.0) & (low >= -ZERO * high)
+        return [j for j in m.rows.tolist() if is_unsigned[self.order[j]]]
+
+    @cached_property
+    def _problem(self) -> tuple[Array, Array]:
+        """Products of columns and torque of each segment and joint, and the variation (m,)."""
+        m, rows = self.motion, self.motion.rows
+        G, j = m.products, np.arange(len(rows))
+        c = G.shape[-1] - m.tau.shape[1] - 1  # place of the URDF's torque
+        tau = c + 1 + self.order[rows]
+        gain, sign = self.gain[rows, None], self.sign[rows, None]
+        scale = np.repeat(gain, c, axis=1)
+        scale[:, c - _DRIVE :] = 1.0
+        b = sign * G[:, j, :, tau].swapaxes(0, 1) - gain * G[:, :, :, c]  # (K, m, C)
+        square = sign[:, 0] * b[:, j, tau] - gain[:, 0] * b[:, j, c]
+        made = np.empty((*G.shape[:2], c + 1, c + 1))
+        made[..., :c, :c] = scale[:, :, None] * scale[:, None] * G[..., :c, :c]
+        made[..., :c, c] = made[..., c, :c] = scale * b[..., :c]
+        made[..., c, c] = square
+        return made, m.size[self.order[rows]]
+
+    @cached_property
+    def share(self) -> Array:
+        """Unexplained share of each torque of the limb, fitted to all instants, (m,)."""
+        products, size = self._problem
+        whole = products.sum(axis=0)
+        return _over(_left(whole, _fitted(whole, size, len(self.motion.q))), size)
+
+    def gain_without(self, joints: tuple[int, ...]) -> float:
+        """Return the gain of the torques of some joints that the other joints predict."""
+        products, size = self._problem
+        rows, at = self.motion.rows, np.isin(self.motion.rows, joints) & (size > 0.0)
+        x = _fitted(products.sum(axis=0), np.where(at, 0.0, size), len(self.motion.q))
+        # tau = gain (X x + X pi) + drives, by the products of these columns
+        G, c = self.motion.products.sum(axis=0), x.shape[1]
+        squares = np.zeros((1 + _DRIVE * int(at.sum()),) * 2)
+        b = np.zeros(len(squares))
+        for k, j in enumerate(np.flatnonzero(at)):
+            own = 1 + _DRIVE * k + np.arange(_DRIVE)
+            P = np.zeros((G.shape[-1], 1 + _DRIVE))
+            P[: c - _DRIVE, 0], P[c, 0] = x[j, : c - _DRIVE], 1.0
+            P[c - _DRIVE : c, 1:] = np.eye(_DRIVE)
+            column = c + 1 + self.order[rows[j]]
+            places = np.append(0, own)
+            squares[np.ix_(places, places)] += P.T @ G[j] @ P / size[j]
+            b[places] += self.sign[rows[j]] * P.T @ G[j][:, column] / size[j]
+        return float(np.linalg.lstsq(squares, b)[0][0])
+
+    @cached_property
+    def held_out(self) -> Array:
+        """Unexplained share of each torque of the limb in segments that are held out, (m,)."""
+        products, size = self._problem
+        whole, left = products.sum(axis=0), np.zeros(len(size))
+        for segment in products:
+            left += _left(segment, _fitted(whole - segment, size, len(self.motion.q)))
+        return _over(left, size)
+
+    @property
+    def unexplained(self) -> Array:
+        """The same share of torques with their signs, at most 1, (m,)."""
+        m, own = self.motion, self.order[self.motion.rows]
+        return np.minimum(_over(self.held_out * m.size[own], _variation(m.tau)[own]), 1.0)
+
+
+def _variation(tau: Array) -> Array:
+    """Return the sum of squares of torques (N, n) about their mean, (n,), 0 if constant."""
+    squares = np.sum((tau - tau.mean(axis=0)) ** 2, axis=0)
+    return np.where(squares > _FLOOR**2 * np.sum(tau**2, axis=0), squares, 0.0)
+
+
+def misfit(share: Array) -> float:
+    """Return the sum of the logarithms of unexplained shares: lower is better."""
+    return float(np.sum(np.log(np.minimum(share, 1.0) + _FLOOR)))
+
+
+def _over(left: Array, size: Array) -> Array:
+    return np.divide(left, size, out=np.zeros_like(left), where=size > 0.0)
+
+
+def _left(products: Array, x: Array) -> Array:
+    """Return the squared residual of each joint: products (m, c + 1, c + 1), x (m, c)."""
+    x = np.concatenate([x, -np.ones((len(x), 1))], axis=1)[:, None]
+    return np.asarray(np.maximum((x @ products @ x.swapaxes(1, 2))[:, 0, 0], 0.0))
+
+
+def _fitted(products: Array, size: Array, count: int) -> Array:
+    """Return parameters of the bodies, near 0, and of each drive, none negative, shape (m, c)."""
+    # The noise of each joint in the second fit is the residual of the first.
+    from scipy.linalg.lapack import dpotrf, dtrtrs
+    from scipy.optimize import nnls
+
+    m, c = len(products), products.shape[1] - 1
+    p = c - _DRIVE
+    offset, first = p + np.arange(m), p + m
+    friction = first + np.arange((_DRIVE - 1) * m).reshape(m, -1)
+    own = np.column_stack([offset, friction])  # (m, 4)
+    every = np.column_stack([np.tile(np.arange(p), (m, 1)), own])
+    noise, x = EXPLAINED * size, np.zeros((m, c))
+    A, b = np.zeros((p + _DRIVE * m,) * 2), np.zeros(p + _DRIVE * m)
+    for _ in range(2):
+        weight = count / np.where(size > 0.0, noise + _FLOOR * size, np.inf)
+        weighted = weight[:, None, None] * products
+        A[:p, :p] = weighted[:, :p, :p].sum(axis=0)
+        A[own, :p] = weighted[:, p:c, :p]
+        A[own[:, :, None], own[:, None]] = weighted[:, p:c, p:c]
+        b[:p], b[own] = weighted[:, :p, c].sum(axis=0), weighted[:, p:c, c]
+        diagonal = np.diagonal(A).copy()
+        np.fill_diagonal(A, (1.0 + _FLOOR**2) * diagonal + 1.0)
+        L = dpotrf(A, lower=True)[0]
+        y = dtrtrs(L, b, lower=True)[0]
+        d = nnls(L[first:, first:].T, y[first:])[0]
+        rest = y[:first] - d @ L[first:, :first]
+        z = dtrtrs(L[:first, :first], rest, lower=True, trans=1)[0]
+        x = np.append(z, d)[every]
+        noise = _left(products, x)
+    return x
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Another meaning of channels or of numbers of the URDF."""
+
+    code: str  # of its finding
+    joints: tuple[int, ...]  # concerned; (): all of them
+    apply: Callable[..., Samples]  # the samples so read, from samples and values
+    values: tuple[float, ...] = ()  # sizes that the torques determine, as a start
+    step: float = 0.0  # of the search for them
+
+    def of(self, samples: Samples) -> Samples:
+        """Return samples so read."""
+        return self.apply(samples, *self.values)
+
+    def refined(self, samples: Samples, most: int) -> "Reading":
+        """Return the reading with the values that explain the torques best."""
+        from scipy.optimize import minimize
+
+        if not self.step:
+            return self
+        x = np.array(self.values)
+        best = minimize(
+            lambda x: misfit(self.apply(samples, *x).share), x, method="Nelder-Mead",
+            options={
+                "initial_simplex": np.vstack([x, x + self.step * np.eye(len(x))]),
+                "xatol": 0.01 * self.step, "fatol": 0.01, "maxfev": most * len(x),
+            },
+        )  # fmt: skip
+        return replace(self, values=tuple(best.x.tolist()))
+
+
+def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
+    """Yield the readings that are tried, general ones before special ones."""
+    m, model = samples.motion, samples.motion.model
+    n, rows, every = len(model.joints), m.rows.tolist(), tuple[int, ...]()
+    turning = [j for j in rows if model.joints[j] not in model.layout.prismatic]
+    one, g = np.eye(n), np.array(model.pin_model.gravity.linear)
+    up = -g / (float(np.linalg.norm(g)) or 1.0)
+    yield Reading("torque_sign", every, partial(_negated, on=np.ones(n)))
+    for speed in (0.1, 0.5, 2.0, 10.0):
+        yield Reading("time_scale", every, _timed, (float(np.log(speed)),), 0.3)
+    axes = [sign * axis for axis in np.eye(3) for sign in (1, -1)]
+    tilted = [_TILT * axis - up for axis in axes if abs(axis @ up) < 0.5 and g.any()]
+    for start in (*axes, *tilted):
+        if not np.allclose(start, -up):
+            yield Reading("gravity", every, _falling, tuple(start.tolist()), 0.1)
+    if g.any():
+        yield Reading("gravity_compensated", every, lambda s: s.changed(subtracted=1.0))
+        yield Reading("gravity_compensated", every, partial(_weightless, on=np.ones(n)))
+        yield Reading("static_torque", every, lambda s: s.changed(inertia=np.zeros(n)))
+        for j in rows:
+            yield Reading("gravity_compensated", (j,), partial(_weightless, on=one[j]))
+    for i, k in combinations(rows, 2):
+        order = np.arange(n)
+        order[[i, k]] = k, i
+        yield Reading("torque_order", (i, k), partial(_reordered, order=order))
+        yield Reading("position_order", (i, k), partial(_exchanged, i=i, k=k))
+        yield Reading("joint_order", (i, k), partial(_exchanged_both, i=i, k=k, order=order))
+    for j in rows:
+        yield Reading("torque_sign", (j,), partial(_negated, on=one[j]))
+        yield Reading("joint_axis", (j,), partial(_reversed, j=j, on=one[j]))
+        if j in turning:
+            yield Reading("position_sign", (j,), partial(_mirrored, j=j))
+    for j in samples.unsigned:
+        yield Reading("unsigned_torque", (j,), partial(_signed, j=j))
+    wrists = (tuple(rows[first:]) for first in range(1, len(rows) - 1))
+    for group in [tuple(rows), *zip(rows, strict=True), *wrists]:
+        gain = samples.gain_without(group)
+        if gain > 0.0:
+            scaled = partial(_scaled, on=one[list(group)].sum(axis=0))
+            named = group if len(group) < len(rows) else every  # another unit
+            yield Reading("current_for_torque", named, scaled, (float(np.log(gain)),), 0.3)
+    for j in turning:
+        for offset in (np.pi / 2, -np.pi / 2, np.pi, _OFFSET, -_OFFSET):
+            yield Reading("position_offset", (j,), partial(_shifted, on=one[j]), (offset,), 0.1)
+    for j in turning if is_gross else ():
+        for turn in _quarters(model, j):
+            yield Reading("axis_direction", (j,), partial(_turned, j=j, turn=turn))
+
+
+def _negated(samples: Samples, on: Array) -> Samples:
+    return replace(samples, sign=samples.sign * (1.0 - 2.0 * on))
+
+
+def _timed(samples: Samples, log_speed: float) -> Samples:
+    speed = np.exp(log_speed)
+    return samples.changed(v=speed * samples.motion.v, a=speed**2 * samples.motion.a)
+
+
+def _falling(samples: Samples, *direction: float) -> Samples:
+    """Return the samples with gravity in another direction."""
+    model, g = samples.motion.model, np.array(direction)
+    size = np.linalg.norm(model.pin_model.gravity.linear) or np.linalg.norm(GRAVITY)
+    return samples.changed(model=model.with_gravity(size * g / np.linalg.norm(g)))
+
+
+def _weightless(samples: Samples, on: Array) -> Samples:
+    return samples.changed(gravity=samples.motion.gravity * (1.0 - on))
+
+
+def _scaled(samples: Samples, log_gain: float, on: Array) -> Samples:
+    return replace(samples, gain=samples.gain * np.exp(log_gain * on))
+
+
+def _shifted(samples: Samples, offset: float, on: Array) -> Samples:
+    return samples.changed(q=samples.motion.q - offset * on)
+
+
+def _reordered(samples: Samples, order: Array) -> Samples:
+    return replace(samples, order=samples.order[order], sign=samples.sign[order])
+
+
+@lru_cache(maxsize=1)  # for two readings
+def _exchanged(samples: Samples, i: int, k: int) -> Samples:
+    """Return the samples with the positions of two joints exchanged."""
+    order = np.arange(samples.motion.q.shape[1])
+    order[[i, k]] = k, i
+    q, v, a = (x[:, order] for x in (samples.motion.q, samples.motion.v, samples.motion.a))
+    return samples.changed(q=q, v=v, a=a)
+
+
+def _exchanged_both(samples: Samples, i: int, k: int, order: Array) -> Samples:
+    return _reordered(_exchanged(samples, i, k), order)
+
+
+@lru_cache(maxsize=1)  # for two readings
+def _mirrored(samples: Samples, j: int) -> Samples:
+    """Return the samples with the position of a joint negated."""
+    sign = np.where(np.arange(samples.motion.q.shape[1]) == j, -1.0, 1.0)
+    q, v, a = (sign * x for x in (samples.motion.q, samples.motion.v, samples.motion.a))
+    return samples.changed(q=q, v=v, a=a)
+
+
+def _reversed(samples: Samples, j: int, on: Array) -> Samples:
+    return _negated(_mirrored(samples, j), on)
+
+
+def _turned(samples: Samples, j: int, turn: tuple[Array, bool]) -> Samples:
+    model = samples.motion.model
+    return samples.changed(model=model.with_turned_axis(model.joints[j], *turn))
+
+
+def _quarters(model: RobotModel, j: int) -> Iterator[tuple[Array, bool]]:
+    """Yield turns of a joint's axis by a quarter, and whether what it carries turns with it."""
+    axis = joint_constants(model.pin_model, model.pin_model.getJointId(model.joints[j]))[-3:]
+    for about, quarter, is_carried in product(np.eye(3), (1, -1), (False, True)):
+        if abs(about @ axis) < 0.5:
+            rotation = np.outer(about, about) + quarter * np.cross(about, np.eye(3))
+            yield rotation, is_carried
+
+
+def _signed(samples: Samples, j: int) -> Samples:
+    """Return the samples with the signs of a torque that bodies and drives of the URDF predict."""
+    # They are iterated from the signs of the bodies' torque, of v and of a.
+    from scipy.optimize import nnls
+
+    m, column = samples.motion, samples.order[j]
+    own, size = replace(m, rows=np.array([j])), np.abs(m.tau[:, column])
+    bodies = own.inertial(m.v, m.a)[:, 0] @ m.model.standard_parameters()[own.moved]
+    X = np.column_stack([bodies, drive_columns(m.model, m.q, m.v, m.a)[:, j]])
+    X /= np.linalg.norm(X, axis=0) + _FLOOR
+    tried = []
+    for sign in (np.sign(bodies), np.sign(m.v[:, j]), np.sign(m.a[:, j])):
+        for _ in range(_TRIED):
+            x, left = nnls(X, sign * size)
+            sign = np.where(X @ x < 0.0, -1.0, 1.0)
+        tried.append((left, sign))
+    tau = m.tau.copy()
+    tau[:, column] = size * min(tried, key=lambda x: x[0])[1]
+    return samples.changed(tau=tau)
+
+
+@dataclass(frozen=True)
+class Best:
+    """A reading that explains the torques of a limb best, together with those before it."""
+
+    reading: Reading
+    alike: tuple[Reading, ...]  # others that explain them about as well
+    gain: float  # decrease of the misfit by it
+    before: Array  # (m,), unexplained shares without it
+    after: Array  # (m,), and with it
+
+
+def best_readings(samples: Samples) -> Iterator[Best]:
+    """Yield the readings that explain the torques of a limb, one after the other."""
+    while True:
+        few = samples.few()
+        if few.share.max() < _POOR:
+            return
+        gains: dict[tuple[str, tuple[int, ...]], tuple[float, int, Reading]] = {}
+        for i, reading in enumerate(readings(few, bool(few.share.max() > _GROSS))):
+            gain = misfit(few.share) - misfit(reading.of(few).share)
+            if gain > gains.get((reading.code, reading.joints), (0.5 * CERTAIN,))[0]:
+                gains[reading.code, reading.joints] = gain, i, reading
+        tried = sorted(gains.values(), key=lambda x: -x[0])[:_TRIED]
+        refined = [(reading.refined(few, 8), i) for _, i, reading in tried]
+        left = {r: (misfit(r.of(samples).share), len(r.joints), i) for r, i in refined}
+        if not left:
+            return
+        least = min(left.values())[0]
+        alike = [r for r in sorted(left, key=lambda r: left[r][1:]) if left[r][0] < least + 1.0]
+        best = alike[0].refined(few, 20)
+        read = best.of(samples)
+        gain = misfit(samples.held_out) - misfit(read.held_out)
+        if min(gain, misfit(samples.share) - misfit(read.share)) < CERTAIN:
+            return
+        yield Best(best, tuple(alike[1:]), gain, samples.unexplained, read.unexplained)
+        samples = read
