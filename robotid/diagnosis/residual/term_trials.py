@@ -24,6 +24,7 @@ from typing import Any, Generic
 
 import numpy as np
 
+from robotid.base.tolerances import REMAINDER
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.diagnosis import decisions
@@ -43,7 +44,6 @@ _NUMBERS = 2**24  # elements of their regressor
 _PER_INDEPENDENT = 2.0  # samples per independent one behind the filter
 _NEAR = 0.5  # periods of the filter's cut-off
 _FREE = 1e3  # prior spread of an added column, in residuals
-_SHORTEST_UNIT = 1e-4  # rows with a smaller sqrt(P_jj) are not used
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,7 +306,7 @@ def _in_units(Y: Array, independent: Array, U: Array) -> Array:
 def _lengths(basis: Array) -> Array:
     """Return sqrt(P_jj), the length of P e_j, of each row, shape (N, n_rows)."""
     squares = 1.0 - np.sum(basis**2, axis=2)
-    return np.asarray(np.sqrt(np.maximum(squares, _SHORTEST_UNIT**2)))
+    return np.asarray(np.sqrt(np.maximum(squares, REMAINDER)))
 
 
 def _noise_level(r: Array, used: Array, own: int, basis: Array | None) -> tuple[Array, Array]:

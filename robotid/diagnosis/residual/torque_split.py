@@ -28,10 +28,8 @@ from robotid.estimation.fitting.fitted import Fit
 from robotid.robot.model import RobotModel
 
 _RIGID = ("gravity", "inertia", "Coriolis")
-_ROWS = 4000  # samples of all recordings together that are split
 _QUARTERS = 4  # parts of a recording for the test of a drift, and pieces of each part
 _SLOW = 0.25  # of the RMS speed: below is low speed
-_NOISY = 0.5  # broadband share above which the residual counts as noise
 _BINS = 10  # of a quantity, with equal numbers of samples
 
 
@@ -205,7 +203,7 @@ class JointTorque:
             "constant": name == "constant",
             "quantity": best is not None,
             "short": self.broadband is None or self.rows.segments is None,
-            "noise": quick >= _NOISY,
+            "noise": quick >= 1.0 - quick,
             "slow": True,
         }
         kind = next(kind for kind, holds in kinds.items() if holds)
@@ -227,7 +225,7 @@ class JointTorque:
 
 def joint_torques(fit: Fit) -> tuple[JointTorque, ...]:
     """Return the torque of each row, its parts, and what its residual depends on."""
-    # At most 4000 samples, of the validation recordings, or of the fitted ones if there are none.
+    # At most 2000 samples, of the validation recordings, or of the fitted ones if there are none.
     validation = [e for e in fit.validation if not e.is_refitted]
     fitted = _torques_of(fit, fit.fitted)
     if not validation:
@@ -238,7 +236,7 @@ def joint_torques(fit: Fit) -> tuple[JointTorque, ...]:
 
 def _torques_of(fit: Fit, evaluations: Sequence[Evaluation]) -> tuple[JointTorque, ...]:
     """Return the torque of each row in some recordings."""
-    model, most = fit.model, _ROWS // len(evaluations)
+    model, most = fit.model, decisions.ROWS // len(evaluations)
     chosen = [(e, spread_rows(len(e.recording.trajectory.t), most)) for e in evaluations]
     motions = [e.recording.trajectory.at(k) for e, k in chosen]
     splits = [
