@@ -6,8 +6,7 @@ Where the prior binds the bodies, those of least squares replace them: a wrong p
 friction.
 
 The nonlinear parameters of a family, its shape, are searched on a grid, then those of a joint are
-refined together (variable projection, Golub, Pereyra 2003). Where constraint forces were
-eliminated, the families of each joint are selected again together with those of the others.
+refined together (variable projection, Golub, Pereyra 2003).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -69,28 +68,11 @@ def choose_drives(
     sample = take_sample(fit, for_drives=True, is_free=True)
     if sample is None:
         return ()
-    drives = _drives(fit, sample, wanted)
-
-    def choose(j: int, together: Sample) -> DriveChoice:
-        names, alone = wanted[sample.joints[j]], together.of_joint(j)
-        return _auto(alone, drives[j]) if names is None else _fixed(alone, drives[j], names)
-
-    choices = {j: choose(j, sample) for j in drives}
-    chosen = {j: choice.terms for j, choice in choices.items() if choice.terms}
-    if sample.basis is None or len(chosen) < 2:
-        return tuple(choices.values())
-    # where constraint forces were eliminated: again, together with the terms of all others
-    first, size = sample.W.shape[1] - len(sample.joints), sample.W.shape[2]
-    owner = np.repeat(list(chosen), [len(terms) for terms in chosen.values()])
-    Z = np.zeros((*sample.r.shape, len(owner)))
-    for j, terms in chosen.items():
-        Z[:, first + j, owner == j] = drives[j].columns(terms)
-    extended = sample.with_columns(Z)
-    for j in chosen:
-        others = [k for k in chosen if k != j and choices[k].terms]
-        which = np.append(np.arange(size), size + np.flatnonzero(np.isin(owner, others)))
-        choices[j] = choose(j, extended.with_some_columns(which))
-    return tuple(choices.values())
+    choices = []
+    for j, drive in _drives(fit, sample, wanted).items():
+        names, alone = wanted[sample.joints[j]], sample.of_joint(j)
+        choices.append(_auto(alone, drive) if names is None else _fixed(alone, drive, names))
+    return tuple(choices)
 
 
 def _drives(
@@ -259,16 +241,16 @@ def _conditioned(
 ) -> _Refined:  # fmt: skip
     """Return the best candidate, or an equally good, better conditioned one of another family."""
 
-    # Equally good: the residual of held-out segments is as small, within its standard error. Better
-    # conditioned: no shape at its bound, or no standard error of the drive increased tenfold.
+    # Equally good: by the rule of the selection. Better conditioned: no shape at its bound, or no
+    # standard error of the drive increased tenfold.
     def refined(i: int) -> _Refined:
         own = _refined(sample, drive, [every.own[k] for k in (*chosen, i)])
         weighted = _reweighted(sample, drive, own)
         is_grown = max(_grown(weighted, drive, own).values(), default=1.0) > decisions.TENFOLD
         return _Refined(i, own, weighted, (bool(_at_bound(drive, own).any()), is_grown))
 
-    def left_of(other: _Refined) -> Array:
-        return _Options.of(sample, drive, other.own).left(range(len(other.own)))
+    def left_of(other: _Refined) -> float:
+        return float(_Options.of(sample, drive, other.own).left(range(len(other.own))).sum())
 
     first = refined(best)
     if not any(first.faults):
@@ -277,17 +259,9 @@ def _conditioned(
     by_family = _of_families(every, left)
     by_family.pop(every.name(best))
     others = [refined(i) for i in by_family.values() if left[i].sum() < whole]
-    better = [other for other in others if other.faults < first.faults]
-    least, slack = left_of(first), decisions.FAMILY.alike * whole
-    alike = [other for other in better if _is_alike(least, left_of(other), slack)]
+    most = left_of(first) + decisions.FAMILY.alike * whole
+    alike = [x for x in others if x.faults < first.faults and left_of(x) <= most]
     return min((first, *alike), key=lambda x: (x.faults, *every.simplicity(x.number)))
-
-
-def _is_alike(best: Array, other: Array, slack: float) -> bool:
-    """Return whether residuals are equal within a slack or the scatter of their difference."""
-    more = other - best
-    scatter = np.sqrt(len(more)) * float(np.std(more, ddof=1))
-    return bool(float(more.sum()) <= max(slack, scatter))
 
 
 def _considered(
@@ -397,9 +371,8 @@ def _grown(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> dict[str,
     _, before = sample.normal.whole
     grown = {}
     for name, u in drive.plain.items():
-        more = u @ T[: len(u)] @ np.linalg.solve(S, T[: len(u)].T @ u)
-        variance = u @ before[: len(u), : len(u)] @ u  # without the columns added to W
-        grown[name] = float(np.sqrt(1.0 + max(more, 0.0) / variance))
+        more = u @ T @ np.linalg.solve(S, T.T @ u)
+        grown[name] = float(np.sqrt(1.0 + max(more, 0.0) / (u @ before @ u)))
     return grown
 
 

@@ -133,11 +133,6 @@ class Sample:
         normal = Normal.of(W, r, segments, len(segments))
         return replace(self, W=W, r=r, weight=weight, segments=segments, normal=normal), order
 
-    def with_some_columns(self, which: Array) -> "Sample":
-        """Return the same samples with fewer columns: which (c,)."""
-        A, B = self.normal.A[:, which[:, None], which], self.normal.B[:, which]
-        return replace(self, W=self.W[..., which], normal=Normal(A, B, self.fitted))
-
     def of_joint(self, j: int) -> "Sample":
         """Return the samples of one joint; other joints count only in the normal equations."""
         row = self.weight.shape[1] - len(self.joints) + j
