@@ -32,7 +32,6 @@ from robotid.robot.drives import FAMILIES
 _GRID = 6  # values of a shape that are tested ...
 _SPAN = 100.0  # ... and the largest over the smallest of them
 _REVOLUTION = 2 * np.pi  # [rad]
-_STEPS = 40  # iterations of the search for all shapes of a joint together
 _LOADED = ("load", "lag")  # families that depend on the torque of the drive
 _Sized = tuple[Family, list[float]]  # a family and its shapes
 
@@ -414,9 +413,9 @@ def _refined(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> list[_S
         (squares,) = whole.left(range(columns.shape[1]))
         return float(np.log(squares + decisions.NOTHING))
 
-    bounds, options = _log_bounds(drive, chosen), {"eps": decisions.STEP, "maxiter": _STEPS}
+    bounds, options = _log_bounds(drive, chosen), {"eps": decisions.STEP}
     best = minimize(left, start, method="L-BFGS-B", bounds=bounds, options=options)
-    return sized(np.exp(best.x if best.fun <= left(start) else start))
+    return sized(np.exp(best.x))
 
 
 def _with_slopes(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> tuple[int, Trial]:
