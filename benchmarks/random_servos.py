@@ -89,3 +89,20 @@ def faulty_logs(rng):
         "delayed_command",
         replace(good.window(1.0, 19.0), q_ref=late),
     )
+    yield (
+        "two command columns exchanged",
+        "command_order",
+        replace(good, q_ref=good.q_ref[:, [1, 0, 2]]),
+    )
+    yield "a command negated", "command_sign", replace(good, q_ref=good.q_ref * [1, -1, 1])
+    stop = np.array([0.6 * np.abs(good.q[:, 0]).max(), 9, 9])
+    noise = 1e-4 * rng.standard_normal(good.q.shape)
+    yield (
+        "end stop at 60 % of the motion",
+        "end_stop",
+        replace(good, q=np.minimum(good.q, stop) + noise),
+    )
+    steps = record(good_commands(rng, servos)["steps"], servos)
+    q = steps.q.copy()
+    q[1000:1800, 0] = q[1000, 0]
+    yield "drive off for 4 s, steps", "not_followed", replace(steps, q=q)

@@ -286,9 +286,9 @@ def _stopped(log: Log, loop: _Loop) -> Iterator[Finding]:
         if share < SHARE_OF_ROWS or visits < SCATTERED:
             continue
         at, near = float(np.median(q[beyond])), DIFFERS * float(sent[beyond].std())
-        is_flat = np.median(np.abs(q[beyond] - at)) < near and np.mean(q > at + near) < AGREES
+        flat = np.mean(np.abs(q[beyond] - at) < near)
         is_far = quantum(loop.q) < near < DIFFERS * np.ptp(q) and sent.max() - at > STILL
-        if is_flat and is_far:
+        if flat > 1 - BETTER**2 and is_far and np.mean(q > at + near) < AGREES:
             most = sign * float(np.max(sign * loop.command))
             figures = {"at": sign * at, "command": most, "share": share, "movements": visits}
             yield finding("end_stop", log.name, loop.name, side=side, unit=loop.unit, **figures)
