@@ -21,9 +21,12 @@ from robotid.diagnosis.decisions import (
     DIFFERS,
     FEWEST,
     NO_ERROR_OF_MASSES,
+    OUTLIER,
     ROWS,
+    SCATTERED,
     SEGMENTS,
     SHARE_OF_ROWS,
+    SIGNIFICANT,
 )
 from robotid.robot.parameters import ParameterLayout
 from robotid.robot.tree import Joint
@@ -31,33 +34,21 @@ from robotid.robot.tree import Joint
 MOVING = 0.1  # Share of the log in which a joint must move
 ZERO = 0.05  # Share of its largest value, below which a torque that is never negative is 0
 _LEAST = {"q": STATIC, "dq": AT_REST}  # [rad or m, rad/s or m/s] smaller values: at rest
-_LEAST_TORQUE = 0.01  # share of the median joint's torque below which a torque is negligible
-_SPIKE = 15.0  # distance of a spike over the typical one ...
-_BEYOND = 1.5  # ... and over the amplitude
-_ABSURD = 5.0  # ... above which it is no motion
-_HARM = 0.02  # share of the energy of its channel with which it ruins a least-squares fit
-_NOISY = 0.3  # noise over signal from which a torque is uninformative
-_LAG = 0.002  # [s] a shorter lag is not reported
+_BEYOND = 1.5  # deviation of a spike over the amplitude
 _BITS = range(9, 24)  # of encoders
-_ENCODER = 0.01  # [bits] difference of a step from 2 pi / 2^bits
-_CLOCK = 0.01  # relative error of the clock from which it is reported: 2 % of an inertia
+_OTHER = 0.01  # relative difference from which a clock, or the step of an encoder, is another one
 _RPM = 30 / np.pi  # [1/min per rad/s]
 _LONG = 0.05  # [s] a longer gap is a warning
-_BUNCHED = 0.2  # [mean steps] a shorter step is of rows that were stamped together ...
-_CLOCK_ALIKE = 0.3  # ... if more than this share of the mean motion per row is in them
+_BUNCHED = 0.2  # [mean steps] a shorter step is of rows that were stamped together
 # [s] A longer rest at an end is reported; in a longer gap, a position that moves as in one step
 # shows that the clock was set.
 _PAUSE = 1.0
-_STALE = 0.05  # share of stale rows from which they are a warning
 _CONTINUES = 0.15  # motion after repeated rows, over that in as many rows before and after ...
 _AROUND = 10  # ... at most so many rows of each
-_LENGTHS = {"": 1.0, "mm": 1e-3, "cm": 1e-2}  # [m]
-_ANGLES = {"": 1.0, "degrees": np.pi / 180}  # [rad]
+_LENGTHS = {"mm": 1e-3, "cm": 1e-2}  # [m]
 _HARDLY = {"rad": 0.2, "m": 0.05}  # smaller range: the joint hardly moves
 _SMOOTHED = 9  # rows of the mean torque that is compared with its largest value ...
-_FLAT = 0.75  # ... and share of rows there from which it is clipped
-_AWAY = 0.2  # of its largest value, above which a torque is not 0 any more
-_SEVERAL = 3  # torques without sign, and times that each reaches 0 and increases again, at least
+_FLAT = 0.8  # ... and share of rows there, and of rows in its direction, from which it is clipped
 _REGULAR = 0.8  # share of holds of about one length that a quantised torque does not reach
 
 
@@ -81,7 +72,7 @@ def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
         if not exchanged:
             yield from _unlike_velocity(log, signals.velocity)
         yield from _velocity_delay(log, signals.velocity_delay)
-        yield from _velocity_scale(log, moved, integral, signals.velocity)
+        yield from _velocity_scale(log, log.v, moved, integral, signals.velocity)
 
 
 def _quantisation(log: Log, kind: str, values: Array, velocity: str) -> Iterator[Finding]:
@@ -98,7 +89,9 @@ def _quantisation(log: Log, kind: str, values: Array, velocity: str) -> Iterator
         todo = "few" if few else "more"
         if kind == "dq" and few:
             todo = "few_auto" if velocity == "auto" else "few_velocity"
-        elif kind == "q" and abs(bits - round(bits)) < _ENCODER and round(bits) in _BITS:
+        elif (
+            kind == "q" and abs(2.0 ** (bits - round(bits)) - 1.0) < _OTHER and round(bits) in _BITS
+        ):
             todo = "few_encoder" if few else "encoder"
         names = [log.joints[j] for j in chosen]
         yield finding(
@@ -117,17 +110,17 @@ def _spikes(
 
     smooth = median_filter(values, size=(5, 1), mode="nearest")
     amplitudes = [_amplitude(*of) for of in zip(values.T, smooth.T, noise, strict=True)]
-    least = _LEAST.get(kind, _LEAST_TORQUE * float(np.median(amplitudes)))
+    least = _LEAST.get(kind, ZERO * float(np.median(amplitudes)))
     for j, (joint, x) in enumerate(zip(log.joints, values.T, strict=True)):
         amplitude, deviation = max(amplitudes[j], least), x - smooth[:, j]
         typical = max(1.48 * float(np.median(np.abs(deviation))), noise[j])
-        smallest = max(_BEYOND * amplitude, _SPIKE * typical)
+        smallest = max(_BEYOND * amplitude, OUTLIER * typical)
         rows = np.flatnonzero(np.abs(deviation) > smallest)
         if len(rows) == 0:
             continue
         largest, first = np.abs(deviation[rows]).max(), float(log.t[rows[0]])
         energy = np.sum(deviation[rows] ** 2) / np.sum((x - np.median(x)) ** 2)
-        is_harmful = is_used and largest > _ABSURD * amplitude and energy > _HARM
+        is_harmful = is_used and largest > SIGNIFICANT * amplitude and energy > SHARE_OF_ROWS
         yield finding(
             "spikes", log.name, joint, subject=f"{kind}_{joint}", channel=kind,
             severity="error" if is_harmful else "note", rows=len(rows), largest=largest,
@@ -142,7 +135,7 @@ def _noise(log: Log, kind: str, values: Array, noise: Array) -> Iterator[Finding
     evidence = dict(zip(log.joints, noise.tolist(), strict=True))
     levels = ", ".join(f"{level:.2g}" for level in noise)
     yield finding("noise", log.name, subject=kind, channel=kind, levels=levels, **evidence)
-    for j in np.flatnonzero(share > _NOISY) if kind == "tau" else ():
+    for j in np.flatnonzero(share**2 > DIFFERS) if kind == "tau" else ():
         yield finding("noisy_torque", log.name, log.joints[j], share=share[j])
 
 
@@ -177,7 +170,7 @@ def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
     scatter = float(np.median(np.abs(used - lag))) * 1.48 if len(used) else 0.0
     step = float(np.median(np.diff(log.t)))
     error = max(scatter / np.sqrt(max(len(used), 1)), 0.02 * step)
-    if abs(lag) < max(_LAG, BEYOND_NOISE * error, 0.1 * step):
+    if abs(lag) < max(BEYOND_NOISE * error, DIFFERS * step):
         return
     is_delayed = abs(lag) >= units.LARGEST_LAG
     yield finding(
@@ -186,38 +179,39 @@ def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
     )  # fmt: skip
 
 
-def _velocity_scale(log: Log, moved: Array, integral: Array, velocity: str) -> Iterator[Finding]:
-    """Yield the factor of the clock, if all velocities have one, and velocities with another."""
-    severity = {"differentiated": "note", "auto": "error" if log.has_torque else "warning"}
-    factors: dict[int, tuple[float, float]] = {}  # by joint, and its relative standard error
+def _velocity_scale(
+    log: Log, v: Array, moved: Array, integral: Array, velocity: str
+) -> Iterator[Finding]:
+    """Yield the factor of the clock, if most velocities have one, and velocities with another."""
+    groups: list[list[tuple[str, float, float]]] = []  # joints with about one factor, and its error
     for j in np.flatnonzero(np.ptp(log.q, axis=0) > STATIC).tolist():
-        if np.ptp(log.v[:, j]) == 0.0:
-            factors[j] = 0.0, 0.0
-        elif (known := _factor(moved[:, j], integral[:, j])) is not None:
-            factors[j] = known
-    every = np.array([*factors.values()])
-    is_known = len(factors) > 1 or len(log.joints) == 1
-    factor, error = _common(*every.T) if is_known else (1.0, 0.0)
-    least = DIFFERS if units.coarse_velocities(log) else _CLOCK  # steps may be truncated
-    if abs(factor / _RPM - 1.0) < _CLOCK:
-        factor = 1.0  # a unit of the velocities
-    elif abs(factor - 1.0) > max(least, BEYOND_NOISE * error):
-        yield finding(
-            "time_scale:velocities", log.name, factor=factor, std_error=error,
-            severity="error" if abs(factor - 1.0) > DIFFERS else "warning",
-        )  # fmt: skip
-    other = {
-        j: own for j, (own, error) in factors.items()
-        if abs(own / factor - 1.0) > DIFFERS + BEYOND_NOISE * error
-    }  # fmt: skip
-    while other:
-        own = next(iter(other.values()))
-        alike = [j for j, x in other.items() if abs(x - own) <= AGREES * own]
-        yield finding(
-            "velocity_scale", log.name, [log.joints[j] for j in alike], factor=own,
-            severity=severity.get(velocity, "error"), what=own == 0.0,
-        )  # fmt: skip
-        other = {j: x for j, x in other.items() if j not in alike}
+        known = _factor(moved[:, j], integral[:, j]) if np.ptp(v[:, j]) > 0 else (0.0, 0.0)
+        if known is not None:
+            least = DIFFERS * known[0] + BEYOND_NOISE * known[1]
+            near = [x for x in groups if abs(x[0][1] - known[0]) <= least]
+            groups += [] if near else [[]]
+            (near or groups)[-1].append((log.joints[j], *known))
+    severity = {"differentiated": "note", "auto": "error" if log.has_torque else "warning"}
+    least = DIFFERS if units.coarse_velocities(log) else _OTHER  # steps may be truncated
+    clock, moving = 1.0, sum(map(len, groups))
+    for group in sorted(groups, key=len, reverse=True):
+        names, factors, errors = zip(*group, strict=True)
+        factor = float(np.mean(factors))
+        error = float(np.hypot(np.std(factors), np.mean(errors))) / len(group) ** 0.5
+        is_unit = factor == 0.0 or abs(factor / _RPM - 1.0) < _OTHER
+        is_common = 2 * len(group) > moving and len(group) >= min(2, len(log.joints))
+        if is_common and not is_unit:
+            if abs(factor - 1.0) > max(least, BEYOND_NOISE * error):
+                clock = factor
+                yield finding(
+                    "time_scale:velocities", log.name, factor=factor, std_error=error,
+                    severity="error" if abs(factor - 1.0) > DIFFERS else "warning",
+                )  # fmt: skip
+        elif abs(factor / clock - 1.0) > DIFFERS + BEYOND_NOISE * error:
+            yield finding(
+                "velocity_scale", log.name, names, factor=factor, what=factor == 0.0,
+                severity=severity.get(velocity, "error"),
+            )  # fmt: skip
 
 
 def _factor(moved: Array, integral: Array) -> tuple[float, float] | None:
@@ -233,18 +227,6 @@ def _factor(moved: Array, integral: Array) -> tuple[float, float] | None:
         return None
     without = np.sqrt((yy.sum() - yy) / (xx.sum() - xx))
     return float(np.sqrt(yy.sum() / xx.sum())), float(np.std(without) * np.sqrt(len(starts) - 1))
-
-
-def _common(factors: Array, errors: Array) -> tuple[float, float]:
-    """Return the factor that most joints share, and its standard error; 1 if they share none."""
-    middle = float(np.median(factors))
-    is_near = np.abs(factors - middle) <= np.maximum(DIFFERS * middle, BEYOND_NOISE * errors)
-    if 2 * is_near.sum() <= len(factors) or middle == 0.0:
-        return 1.0, 0.0
-    near = factors[is_near]
-    return float(near.mean()), float(
-        np.hypot(near.std(), errors[is_near].mean()) / len(near) ** 0.5
-    )
 
 
 def _amplitude(x: Array, smooth: Array, noise: float) -> float:
@@ -275,21 +257,27 @@ def _white_noise(t: Array, values: Array) -> Array:
 def check_limits(log: Log, limits: Sequence[Joint]) -> Iterator[Finding]:
     """Yield the joints whose positions or torques are far beyond the limits of the URDF."""
     every = max(1, len(log.t) // ROWS)
-    for q, joint in zip(log.q[::every].T, limits, strict=True):
-        if not joint.has_limits:
-            continue
-        units = _LENGTHS if joint.type == "prismatic" else _ANGLES
-        extents = {unit: _extent(size * q, joint) for unit, size in units.items()}
-        if extents.pop("") <= NO_ERROR_OF_MASSES:
-            continue
-        fitting = {unit: 100 * units[unit] for unit, x in extents.items() if x <= 1 + DIFFERS}
+    ends = np.array([(x.lower, x.upper) if x.has_limits else (np.nan, np.nan) for x in limits])
+    is_prismatic = np.array([x.type == "prismatic" for x in limits])
+    q = log.q[::every]
+
+    def extents(size: float) -> Array:
+        """Return the extents of the motion over the ranges of the joints, shape (n,)."""
+        # of prismatic joints about the middle of the range: the zero of an encoder is no unit
+        middle = np.where(is_prismatic, ends.mean(axis=1), size * np.median(q, axis=0))
+        farthest = np.quantile(np.abs(size * q - middle), 1 - SHARE_OF_ROWS, axis=0)
+        return np.asarray(2 * farthest / np.ptp(ends, axis=1))
+
+    for j in np.flatnonzero(extents(1.0) > NO_ERROR_OF_MASSES).tolist():
+        joint, sizes = limits[j], _LENGTHS if is_prismatic[j] else {"degrees": np.pi / 180}
+        fitting = [unit for unit, size in sizes.items() if extents(size)[j] <= 1 + DIFFERS]
         key = toml_key(joint.name)
-        ways = (f"percent = {{ {key} = [0, {x:.4g}] }} ({unit})" for unit, x in fitting.items())
+        ways = (f"percent = {{ {key} = [0, {100 * sizes[x]:.4g}] }} ({x})" for x in fitting)
         yield finding(
             "beyond_limits", log.name, joint.name, what=bool(fitting), cure=bool(fitting),
-            low=q.min(), high=q.max(), lower=joint.lower, upper=joint.upper,
-            units=" or ".join(fitting), settings=" or ".join(ways),
-            unit="m" if joint.type == "prismatic" else "rad",
+            low=q[:, j].min(), high=q[:, j].max(), lower=joint.lower, upper=joint.upper,
+            unit="m" if is_prismatic[j] else "rad", units=" or ".join(fitting),
+            settings=" or ".join(ways),
         )  # fmt: skip
     effort = np.array([x.effort if 0 < x.effort < np.inf else np.nan for x in limits])
     is_placeholder = len({*effort}) == 1 and np.log10(effort[0]) % 1 == 0
@@ -300,14 +288,6 @@ def check_limits(log: Log, limits: Sequence[Joint]) -> Iterator[Finding]:
     if len(beyond):
         names = [log.joints[j] for j in beyond]
         yield finding("beyond_effort", log.name, names, times=times[beyond].min())
-
-
-def _extent(q: Array, joint: Joint) -> float:
-    """Return the extent of a motion over the range of a joint [-]."""
-    # Of a prismatic joint about the middle of the range: the zero of an encoder is no unit.
-    middle = (joint.lower + joint.upper) / 2 if joint.type == "prismatic" else np.median(q)
-    farthest = np.quantile(np.abs(q - middle), 1 - SHARE_OF_ROWS)
-    return 2 * float(farthest) / (joint.upper - joint.lower)
 
 
 def check_clock(log: Log) -> Iterator[Finding]:
@@ -393,7 +373,7 @@ def _bunches(log: Log, step: Array) -> Iterator[Finding]:
     share = float(np.mean(is_bunched))
     moved = np.abs(np.diff(log.q, axis=0)).mean(axis=0)
     change = np.abs(np.diff(log.q[:, int(np.argmax(moved))]))  # of the joint that moves most
-    if share < SHARE_OF_ROWS or change[is_bunched].mean() <= _CLOCK_ALIKE * change.mean():
+    if share < SHARE_OF_ROWS or change[is_bunched].mean() <= BETTER * change.mean():
         return
     usual = float(np.median(step[~is_bunched]))
     yield finding(
@@ -421,7 +401,7 @@ def _stale_rows(log: Log, step: Array) -> Iterator[Finding]:
     lengths = [stop - start for start, stop in runs]
     share = sum(lengths) / len(log.t)
     yield finding(
-        "stale_rows", log.name, severity="warning" if share > _STALE else "note",
+        "stale_rows", log.name, severity="warning" if share > AGREES else "note",
         rows=sum(lengths), share=share, longest_run=max(lengths),
     )  # fmt: skip
 
@@ -452,8 +432,8 @@ def check_torque_channels(log: Log) -> Iterator[Finding]:
         return
     yield from _clipping(log)
     # a single torque that is never negative may be of a joint that gravity loads in one direction
-    touching = sum(_touches(x) >= _SEVERAL for x in log.tau.T)
-    if log.tau.min() >= 0 and touching >= _SEVERAL:
+    touching = sum(_touches(x) >= SCATTERED for x in log.tau.T)
+    if log.tau.min() >= 0 and touching >= SCATTERED:
         yield finding("unsigned_torque", log.name, joints=touching, kind="all", cure="all")
     yield from _held(log)
 
@@ -466,8 +446,10 @@ def _clipping(log: Log) -> Iterator[Finding]:
 
     moving = np.append((np.diff(log.q, axis=0) != 0).any(axis=1), False)
     ahead = np.minimum(np.arange(len(log.t)) + _SMOOTHED, len(log.t) - 1)
-    own = np.abs(log.q[ahead] - log.q) > AT_REST * (log.t[ahead] - log.t)[:, None]  # (N, n)
-    noise = _white_noise(log.t, log.tau)
+    travel, least = log.q[ahead] - log.q, AT_REST * (log.t[ahead] - log.t)[:, None]  # (N, n)
+    own = np.abs(travel) > least
+    noise, fewest = _white_noise(log.t, log.tau), max(_SMOOTHED, SHARE_OF_ROWS * len(log.t))
+    smooth = uniform_filter1d(log.tau, _SMOOTHED, axis=0, mode="nearest")
     for j, (joint, x) in enumerate(zip(log.joints, log.tau.T, strict=True)):
         if moving.any() and np.ptp(x) == 0:
             is_undriven = np.ptp(log.q[:, j]) > STILL and not x.any()
@@ -478,27 +460,28 @@ def _clipping(log: Log) -> Iterator[Finding]:
             )
             continue
         band = (BEYOND_NOISE + 1) * noise[j] / np.sqrt(_SMOOTHED)  # from 3 errors above to 1 below
-        step = units.quantum(x)
-        if not own[:, j].any() or 0 < np.ptp(x) < units.COARSE * step:
+        if not own[:, j].any():
             continue
         for sign in (1.0, -1.0):
-            y = uniform_filter1d(sign * x, _SMOOTHED, mode="nearest")
-            depth = y[own[:, j]].max() - y
-            at = (depth <= band) & own[:, j]
-            runs = [(i, k) for i, k in runs_of(depth <= 4 * band) if at[i:k].any()]
-            near = sum(int(own[i:k, j].sum()) for i, k in runs)
-            is_flat = at.sum() > _FLAT * near and 4 * band < np.median(depth)
-            limit = float(np.median(x[at])) if is_flat else sign * float(np.max(sign * x))
-            width = BEYOND_NOISE * noise[j] if is_flat else 0.0
-            rows = np.sum((np.abs(x - limit) <= width) & moving)
-            if rows >= max(_SMOOTHED, SHARE_OF_ROWS * len(x)):
+            depth = np.max(sign * smooth[own[:, j], j]) - sign * smooth[:, j]
+            at, limit = (depth <= band) & own[:, j], sign * float(np.max(sign * x))
+            rows = np.sum((x == limit) & moving)
+            if at.sum() >= fewest > rows:
+                runs = [(i, k) for i, k in runs_of(depth <= 4 * band) if at[i:k].any()]
+                near = sum(int(own[i:k, j].sum()) for i, k in runs)
+                along = np.sum(sign * travel[:, j] > least[:, 0])
+                is_flat = _FLAT * near < at.sum() < _FLAT * along  # else a maximum, or friction
+                if is_flat and 4 * band < np.median(depth):
+                    limit = float(np.median(x[at]))
+                    rows = np.sum((np.abs(x - limit) <= BEYOND_NOISE * noise[j]) & moving)
+            if rows >= fewest and not np.ptp(x) < units.COARSE * units.quantum(x):
                 yield finding("clipped", log.name, joint, limit=limit, share=rows / len(x))
 
 
 def _touches(x: Array) -> int:
     """Return how often a torque reaches 0 and increases again."""
     top = float(np.quantile(np.abs(x), 0.995))
-    near = runs_of(x < _AWAY * top)
+    near = runs_of(x < BETTER * top)
     return sum(x[i:k].min() < ZERO * top for i, k in near if i > 0 and k < len(x))
 
 

@@ -163,9 +163,10 @@ def _examine_torques(model: RobotModel, logs: Sequence[_Examined], signals: Sign
         one.findings[:] = [x for x in one.findings if x not in beyond or moved.isdisjoint(x.joints)]
         errors = [x for x in (*beyond, *off) if x.severity == "error"]
         named = {joint for x in errors for joint in x.joints} - moved
+        of_all = ("unexplained_torque", "urdf_mismatch") if named else ()
         torques = [
             x for x in torques
-            if x.code not in _OF_A_DRIVE or not x.joints or not named.issuperset(x.joints)
+            if not (named.issuperset(x.joints) and x.code in (_OF_A_DRIVE if x.joints else of_all))
         ]  # fmt: skip
         one.findings += [*off, *torques]
         if not any(x.severity == "error" for x in torques):

@@ -15,30 +15,22 @@ from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import low_pass
-from robotid.data.units import AT_REST
+from robotid.data.units import AT_REST, LARGEST_LAG
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import BEYOND_NOISE, ROWS
+from robotid.diagnosis.decisions import BEYOND_NOISE, DIFFERS, FEWEST, LEAST_SHARE, ROWS, SEGMENTS
 from robotid.diagnosis.logs.channels import MOVING, distance
 from robotid.diagnosis.logs.probe import coupled_columns, smooth_motion
 from robotid.dynamics.rows import inertial_rows
 from robotid.robot.model import RobotModel
 
 _LONGEST = 0.1  # [s] largest delay
-_NEAR = 0.01  # [s] half-width of the misfit's parabola around the delay
 _GRID = np.linspace(-_LONGEST, _LONGEST, 81)
-_FINEST = 0.001  # [s] apparent delay by unknown friction ...
-_HELD = 0.1  # [samples] ... and by a held torque
-_DELAYED = 0.04  # [s] a longer delay must explain ...
-_HELPS = 0.15  # ... this share of the unexplained torque: other model errors look like one, too
-_FEW = 100  # least number of rows of a joint that is used
-_SLOW = 0.05  # [rad/s] slower: a drive may be in stiction ...
-_AWAY = 0.75  # [periods of the filter] ... and its friction is unknown for this time around
-_BLOCKS = 8  # number of segments with these instants in a long log, and of blocks of the jackknife
+_NEAR = DIFFERS * _LONGEST  # [s] half-width of the misfit's parabola around the delay
 _OVERSAMPLED = 8.0  # instants per period of the filter: the regressor has a larger bandwidth
 # Cut-off of the comparison over the job's, and over the rate at most, since interpolation smooths
-# the noise at higher frequencies.
-_BAND = 1.5, 0.15
-_WIDE = 3.0, 0.4  # the same of the motion from which the regressor is computed
+# the noise at higher frequencies; the motion from which the regressor is computed has twice both.
+_TIMES = 1.5
+_OF_RATE = 0.15
 _SETTLED = 1.5  # [periods of the filter] settling time of the filter at an end of a segment
 _HARMONICS = 4  # of a torque that is periodic in the position, as of gears and magnets
 # Share of a torque that is noise even in an exact log, and of the largest singular value that
@@ -114,10 +106,8 @@ def check_torque_delay(
     step = float(np.median(np.diff(log.t)))
     rate = min(1 / step, signals.rate or np.inf)
     # the comparison is filtered even if the job has no filter: see _BAND
-    times, most = _BAND
-    cutoff = min(times * (signals.cutoff or np.inf), most * rate)
-    times, most = _WIDE
-    wide = replace(signals, cutoff=signals.cutoff and min(times * signals.cutoff, most * rate))
+    cutoff = min(_TIMES * (signals.cutoff or np.inf), _OF_RATE * rate)
+    wide = replace(signals, cutoff=signals.cutoff and 2 * cutoff)
     motion = smooth_motion(model, log, wide)
     misfit = _misfit(model, motion, replace(signals, cutoff=cutoff), 1 / cutoff)
     if misfit is None:
@@ -125,11 +115,12 @@ def check_torque_delay(
     delay, error, gain = misfit.delay(), misfit.error(), misfit.gain()
     if not np.isfinite([delay, error, gain]).all():
         return
-    error = float(np.hypot(error, max(_FINEST, _HELD * step)))
-    least = _HELPS if abs(delay) > _DELAYED else 0.0
+    # friction, and a torque that is held between rows, look like a delay of a tenth of these
+    error = float(np.hypot(error, DIFFERS * max(_NEAR, step)))
+    least = LEAST_SHARE if abs(delay) > LARGEST_LAG else 0.0
     todo = "none"
     if abs(delay) > BEYOND_NOISE * error and gain > least:
-        todo = "of_load" if gain < misfit.by_load else "clear" if gain > _HELPS else "filter"
+        todo = "of_load" if gain < misfit.by_load else "clear" if gain > LEAST_SHARE else "filter"
     yield finding(
         "torque_delay", name, severity="note" if todo in ("none", "of_load") else "warning",
         todo=todo, sense=delay > 0, delay=delay, std_error=error, gain=gain,
@@ -169,9 +160,10 @@ def _segments(model: RobotModel, motion: Trajectory, every: int) -> list[Array]:
     if len(moving) == 0:
         return []
     first, stop = int(moving[0]), int(moving[-1]) + 1
-    length = ROWS * every // _BLOCKS
-    if stop - first > _BLOCKS * length:
-        starts = np.linspace(first, stop - length, _BLOCKS).astype(int)
+    windows = SEGMENTS // 2
+    length = ROWS * every // windows
+    if stop - first > windows * length:
+        starts = np.linspace(first, stop - length, windows).astype(int)
         chosen = [np.arange(start, start + length) for start in starts]
     else:
         chosen = [np.arange(first, stop)]
@@ -204,8 +196,8 @@ def _window(
     )
     at = motion.t[coarse[inner]]
     is_reversal = np.diff(np.sign(v), axis=0, append=np.sign(v[-1:])) != 0
-    slow = is_reversal | (np.abs(v) < _SLOW)
-    steady = [distance(at, t[slow[:, j]]) > _AWAY * period for j in range(v.shape[1])]
+    slow = is_reversal | (np.abs(v) < AT_REST)
+    steady = [distance(at, t[slow[:, j]]) > _SETTLED / 2 * period for j in range(v.shape[1])]
     tau = low_pass(motion.tau[rows], 1 / step, signals)
     delayed = np.moveaxis(_interpolated(t, tau, at + _GRID[:, None]), 0, 2)  # (N, n, delays)
     drive = np.concatenate([own, coupled], axis=2)  # (N, n, k)
@@ -236,7 +228,7 @@ def _squares(
     """Return the unexplained part of a joint's torque, and its instants."""
     # Shapes (blocks, delays), in the second friction grows with the load; None if it hardly moves.
     used = int(np.count_nonzero(steady))
-    if used < max(_FEW, MOVING * len(steady)):
+    if used < max(SEGMENTS * FEWEST, MOVING * len(steady)):
         return None
     inertial, drive, load = inertial[steady], drive[steady], load[steady]
     tau = np.ascontiguousarray(delayed[steady].T)
@@ -246,7 +238,7 @@ def _squares(
         return None
     Q = _orthonormal(np.hstack([inertial, drive, np.ones((used, 1))]))
     tau -= (tau @ Q) @ Q.T
-    blocks = np.array_split(tau, _BLOCKS, axis=1)
+    blocks = np.array_split(tau, SEGMENTS, axis=1)
     plain = np.array([np.sum(b**2, axis=1) for b in blocks]) / size
     rest = load - Q @ (Q.T @ load)
     if rest @ rest > _EXACT**2 * load @ load:

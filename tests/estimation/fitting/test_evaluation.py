@@ -120,6 +120,16 @@ def test_rows_recorded_twice_are_found_whatever_the_clock_says(ur5, rng):
     before, after = log.window(end=6.0), log.window(start=6.0)
     assert before.t[-1] == after.t[0]  # both hold the row where they meet
     assert not shares_rows(after, before)
+    still = [np.repeat(x[:1], 400, axis=0) for x in (log.q, log.tau)]
+    two = (
+        Log(
+            0.01 * np.arange(400 + len(x.t)),
+            *map(np.vstack, zip(still, (x.q, x.tau), strict=True)),
+            log.joints,
+        )
+        for x in (log, other)
+    )
+    assert not shares_rows(*two)  # both are at rest in one pose first
     jittered = Log(t=log.t, q=log.q, tau=log.tau * (1 + 1e-12), joints=log.joints)
     assert not shares_rows(jittered, log)
 
