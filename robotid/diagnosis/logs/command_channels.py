@@ -256,12 +256,12 @@ def _confused(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
 
     left, joints = np.ones((2, len(loops), len(loops))), np.arange(len(loops))
     for j, loop in enumerate(loops):
-        lead = loop.means[1].shape[1] - 1  # its command may also be logged too late
-        own = min(loop.response_to(loop)[1], loop.response_to(loop, lead=lead)[1])
+        left[0, j, j] = own = loop.response_to(loop)[1]
         if own > 1 - CORRELATED:
+            lead = loop.means[1].shape[1] - 1  # its command may also be logged too late
             for k, other in enumerate(loops):  # unexplained by its command, or by the opposite
                 left[:, j, k] = [loop.response_to(other, sign)[1] for sign in (1, -1)]
-        left[0, j, j] = own
+            left[0, j, j] = min(own, loop.response_to(loop, lead=lead)[1])
     best, owner = left.min(axis=0), linear_sum_assignment(left.min(axis=0))[1]
     for group in connected(owner == joints[:, None]):
         stated, others = left[0, group, group], best[group, owner[group]]

@@ -1,13 +1,14 @@
 """identify_loops(): closed-loop identification from command logs, its result and its findings."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.base.findings import Finding, by_severity, listed, quoted
 from robotid.base.tolerances import LEAST_DIVISOR
 from robotid.base.typing import Array, ProgressCallback, ignore_progress, report_stage
@@ -371,7 +372,9 @@ def loop_findings(
 ) -> tuple[Finding, ...]:
     """Return the findings of logs and fit, the most severe first."""
     settled = [_settled_delay(one, result) for one in examined]
-    gains = [*_other_gains(result)]
+    gains: list[Finding] = []
+    with suppress(NotConvergedError, DataError):  # a log that cannot be simulated, or a short one
+        gains.extend(_other_gains(result) if result.has_gains else ())
     causes = [one for one in settled if one.code in codes_with("names_cause")]
     causes += [*gains, *_limits_found(result)]
     known = {joint for one in causes for joint in one.joints}
@@ -509,7 +512,7 @@ def _other_gains(result: PositionIdentification) -> Iterator[Finding]:
         first, *rest = result.fitted
         loops, others, least = fit_one_log(fit, first.log), first.log.name, 0.0 * errors
         runs = (*rest, *runs)
-    for run in runs if result.has_gains else ():
+    for run in runs:
         joints = np.flatnonzero(_relative_errors(run) > np.maximum(least, GOOD_POSITION))
         for j, figures in fit_gains(fit.simulator, loops, run.log, joints).items():
             # the motion with a missing friction term may have a gain that differs by some 30 %
@@ -522,7 +525,7 @@ def _other_gains(result: PositionIdentification) -> Iterator[Finding]:
 
 def _valid_bands(result: PositionIdentification) -> Iterator[Finding]:
     """Yield up to which frequency the model predicts a joint whose position error is not small."""
-    for run in result.validation or result.fitted:
+    for run in (result.validation or result.fitted) if result.has_gains else ():
         for j in np.flatnonzero(_relative_errors(run) > GOOD_POSITION).tolist():
             band = run.valid_band(j)
             if band is not None and 100.0 * band["below"] < GOOD_POSITION:

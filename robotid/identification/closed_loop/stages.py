@@ -176,7 +176,7 @@ def fit_one_log(fitted: Fitted, log: Log) -> Loops:
     windows = _few(cut_windows(log, _WINDOW, _LEAD))
     alone = replace(fitted.simulator, windows=windows, base=fitted.loops)
     alone = replace(alone, free_parameters=of_drives)
-    return alone.loops(OutputError().minimise(alone, fitted.estimate.theta[free]))
+    return alone.loops(OutputError(rounds=1).minimise(alone, fitted.estimate.theta[free]))
 
 
 def fit_gains(
@@ -190,7 +190,7 @@ def fit_gains(
     windows, own = _few(cut_windows(log, _WINDOW, _LEAD)), np.stack([loops.kp, loops.kd])[:, joints]
     pairs = [(what, int(j)) for what in ("kp", "kd") for j in joints]
     free = tuple(FreeParameter(f"{w} {j}", w, (j,), 0.0, np.inf, 0.0) for w, j in pairs)
-    alone, errors = LoopSimulator(simulator.robot, windows, loops, free), []
+    alone, errors = LoopSimulator(simulator.fine or simulator.robot, windows, loops, free), []
     for factor in 2.0 ** np.arange(-3, 4) if pairs else ():
         # if kd grows with the root of kp, the damping ratio stays the same
         start = (own * [[factor], [np.sqrt(factor)]]).reshape(-1)
