@@ -22,7 +22,7 @@ ACCELERATION = ("ax", "ay", "az", "alx", "aly", "alz")
 #: Names of the values of an IMU: orientation, angular velocity [rad/s], specific force [m/s^2].
 IMU = ("qx", "qy", "qz", "qw", "wx", "wy", "wz", "ax", "ay", "az")
 _WINDOW = 0.5  # [s] shortest rest in which the bias of the gyroscopes is estimated
-_STILL = 0.02  # [rad/s] largest standard deviation of a gyroscope at rest
+GYROSCOPE_NOISE = 0.02  # [rad/s] largest standard deviation of a gyroscope at rest
 _UNMOVED = 5e-3  # [rad or m] largest motion of a joint at rest
 LEVEL = 2.0  # [s] in which the mean specific force is vertical
 _BREAK = 0.1  # [s] a longer time step: the angular velocity in it is not known
@@ -386,7 +386,7 @@ def bias_at_rest(parts: Sequence[tuple[Array, Array, Array]]) -> tuple[Array, st
             for first, stop in pairwise(edges)
             if stop - first > 4
             and np.ptp(q[first:stop], axis=0).max(initial=0.0) < _UNMOVED
-            and w[first:stop].std(axis=0).max() < _STILL
+            and w[first:stop].std(axis=0).max() < GYROSCOPE_NOISE
         ]
     if not means:
         return np.zeros(3), (

@@ -220,6 +220,7 @@ class TorqueSlopes(NamedTuple):
     by_a: Array  # by the accelerations, likewise: the mass matrix of the bodies
     by_gravity: Array  # by gravity, along the axes of the world, shape (N, n, 3)
     by_origin: Array  # by each joint's origin in the body before, (N, n, n, 3): torque, joint, axis
+    by_axis: Array  # by turning each joint about the two directions across its axis, (N, n, n, 2)
 
 
 def predict(
@@ -354,6 +355,18 @@ def body_slopes(model: RobotModel, pi: Array, trajectory: Trajectory) -> TorqueS
     return TorqueSlopes(*_of_consistent(_torque_slopes, model, pi, *state))
 
 
+def force_slopes(model: RobotModel, trajectory: Trajectory) -> Array:
+    """Return the derivatives of the torques by a force (3,) on the last body's tip, (N, n, 3)."""
+    engine, G = model.pin_model, model.velocity_map
+    own = [k for k, frame in enumerate(engine.frames) if frame.parentJoint == engine.njoints - 1]
+    tip = max(own, key=lambda k: np.linalg.norm(engine.frames[k].placement.translation))
+    slopes, data = np.empty((len(trajectory.q), len(G), 3)), engine.createData()
+    for D, q in zip(slopes, model.configurations(trajectory.q), strict=True):
+        J = pin.computeFrameJacobian(engine, data, q, tip, pin.LOCAL_WORLD_ALIGNED)
+        D[:] = -J[:3].T
+    return np.asarray(G.T @ slopes)
+
+
 def body_slopes_by_position(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
     """Return ``body_slopes`` by the positions alone, (N, n, n), several times as fast."""
     return _of_consistent(_position_slopes, model, pi, trajectory.q, trajectory.v, trajectory.a)[0]
@@ -415,10 +428,10 @@ def _torque_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -
     plain, G = model.with_parameters(pi).pin_model, model.velocity_map
     extended, joints = _with_movable_origins(plain)
     own = np.array([extended.joints[k].idx_v for k in joints])  # rows of the robot's own joints
-    before = np.array([extended.joints[k - 1].idx_v for k in joints])  # and of their origins
+    before = np.array([extended.joints[k - 1].idx_v for k in joints])  # and of their places
     first_q = [(extended.joints[k].idx_q, plain.joints[i].idx_q, plain.joints[i].nq)
                for i, k in enumerate(joints, start=1)]  # fmt: skip
-    configurations = np.zeros((len(q), extended.nq))
+    configurations = np.tile(pin.neutral(extended), (len(q), 1))
     known = model.configurations(q)
     for to, here, size in first_q:
         configurations[:, to : to + size] = known[:, here : here + size]
@@ -435,24 +448,27 @@ def _torque_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -
     D: Array = G.T @ slopes  # tau = G^T tau_pinocchio
     by_q, by_v, by_a = D[..., own] @ G
     leaders = np.array([plain.getJointId(name) - 1 for name in model.joints])
-    axes = before[leaders][:, None] + np.arange(3)
-    roots = before[[plain.parents[i] == 0 for i in range(1, plain.njoints)]]
-    falling = sum(D[2][..., root : root + 3] for root in roots)  # as the base is accelerated
-    return by_q, by_v, by_a, -falling, D[0][..., axes]
+    first = before[leaders][:, None]
+    rotations = np.array([plain.jointPlacements[i + 1].rotation for i in range(len(before))])
+    by_origin = np.einsum("Nnjk,jik->Nnji", D[0][..., first + range(3)], rotations[leaders])
+    roots = [i for i in range(len(before)) if plain.parents[i + 1] == 0]
+    falling = [D[2][..., before[i] + np.arange(3)] @ rotations[i].T for i in roots]
+    axes = {joint.name: joint.axis for joint in model.tree.joints}
+    across = np.stack([np.linalg.svd([axes[x]])[2][1:] for x in model.joints])  # (n, 2, 3)
+    by_axis = np.einsum("Nnjk,jik->Nnji", D[0][..., first + range(3, 6)], across)
+    # gravity acts as an acceleration of the base in the opposite direction
+    return by_q, by_v, by_a, -sum(falling), by_origin, by_axis
 
 
 def _with_movable_origins(model: pin.Model) -> tuple[pin.Model, list[int]]:
-    """Return a robot with a 3-axis prismatic joint before each joint, and its own joints in it."""
+    """Return a robot with a 6-axis joint before each joint, and its own joints in it."""
     extended, joints = pin.Model(), [0]
     extended.gravity = model.gravity
     for i in range(1, model.njoints):
         place, name = model.jointPlacements[i], model.names[i]
-        there = pin.SE3(np.eye(3), place.translation)
-        origin = extended.addJoint(
-            joints[model.parents[i]], pin.JointModelTranslation(), there, f"{name} origin"
-        )
-        rotated = pin.SE3(place.rotation, np.zeros(3))
-        joints.append(extended.addJoint(origin, model.joints[i], rotated, name))
+        parent = joints[model.parents[i]]
+        free = extended.addJoint(parent, pin.JointModelFreeFlyer(), place, f"{name} place")
+        joints.append(extended.addJoint(free, model.joints[i], pin.SE3.Identity(), name))
         extended.appendBodyToJoint(joints[-1], model.inertias[i], pin.SE3.Identity())
     return extended, joints[1:]
 
@@ -508,11 +524,11 @@ def _drive_motion(model: RobotModel, trajectory: Trajectory, has_rate: bool) -> 
         return motion
     if layout.remembering:
         m = m.with_states(remembered(layout, motion))
-    rate = _rate(load + drive_torque(model, model.carried_by, m), m)
+    rate = torque_rate(load + drive_torque(model, model.carried_by, m), m)
     return drive_motion(layout, m.q, m.v, m.a, signs, load, rate, begins)
 
 
-def _rate(torque: Array, motion: Trajectory) -> Array:
+def torque_rate(torque: Array, motion: Trajectory) -> Array:
     """Return the change of torques within each segment, shape (N, n) [N m/s, N/s]."""
     rate = np.zeros_like(torque)
     edges = np.flatnonzero(np.diff(motion.segment)) + 1

@@ -13,6 +13,7 @@ from robotid.dynamics.rows import friction_speeds
 from robotid.dynamics.torque import (
     body_slopes,
     body_slopes_by_position,
+    force_slopes,
     joint_torque_regressor,
     predict,
     predict_instants,
@@ -153,7 +154,8 @@ def test_slopes_are_those_of_differences_by_motion_and_gravity(case):
     found = body_slopes(model, pi, m)
     n = len(model.joints)
     np.testing.assert_allclose(body_slopes_by_position(model, pi, m), found.by_q, atol=1e-10)
-    assert [x.shape for x in found] == [(4, n, n)] * 3 + [(4, n, 3), (4, n, n, 3)]
+    shapes = [(4, n, n)] * 3 + [(4, n, 3), (4, n, n, 3), (4, n, n, 2)]
+    assert [x.shape for x in found] == shapes
 
     def close(slope, up, down):
         exact = (up - down) / (2 * H)
@@ -178,27 +180,52 @@ def test_slopes_are_those_of_differences_by_motion_and_gravity(case):
         close(found.by_gravity @ axis, pulled(H), pulled(-H))
 
 
-def test_slopes_by_the_origin_of_each_joint_are_those_of_differences(case):
+def across(model, joint):
+    """Return the two directions across the axis that the URDF states for a joint."""
+    (axis,) = (x.axis for x in model.tree.joints if x.name == joint)
+    return np.linalg.svd([axis])[2][1:]
+
+
+@pytest.mark.parametrize("kind", ["origin", "axis"])
+def test_slopes_by_the_place_of_each_joint_are_those_of_differences(case, kind):
     model, pi, m = case
     q, v, a = m.q, m.v, m.a
-    found = body_slopes(model, pi, m).by_origin
+    found = getattr(body_slopes(model, pi, m), f"by_{kind}")
     for j, joint in enumerate(model.joints):
-        for k in range(3):
+        directions = np.eye(3) if kind == "origin" else across(model, joint)
+        for k, direction in enumerate(directions):
 
-            def moved(side, joint=joint, k=k):
+            def moved(side, joint=joint, direction=direction):
                 def change(engine):
                     i = engine.getJointId(joint)
-                    place = engine.jointPlacements[i].copy()
-                    shift = np.zeros(3)
-                    shift[k] = side
-                    place.translation = place.translation + shift
+                    place, shift = engine.jointPlacements[i].copy(), side * direction
+                    if kind == "origin":
+                        place.translation = place.translation + shift
+                    else:
+                        place.rotation = place.rotation @ pin.exp3(shift)
                     engine.jointPlacements[i] = place
 
                 return torque(model, pi, q, v, a, change)
 
             exact = (moved(H) - moved(-H)) / (2 * H)
             np.testing.assert_allclose(found[:, :, j, k], exact, atol=1e-6)
-    assert np.abs(found).max() > 0.1
+    assert np.abs(found).max() > (0.1 if kind == "origin" else 0.01)
+
+
+def test_the_slope_by_a_force_on_the_tip_is_that_of_the_virtual_work(case):
+    model, pi, m = case
+    engine, G = model.with_parameters(pi).pin_model, model.velocity_map
+    last, data = engine.njoints - 1, engine.createData()
+    frames = [k for k, x in enumerate(engine.frames) if x.parentJoint == last]
+    tip = max(frames, key=lambda k: np.linalg.norm(engine.frames[k].placement.translation))
+    found = force_slopes(model, m)
+    for by_force, q in zip(found, model.configurations(m.q), strict=True):
+        for j, push in enumerate(H * G.T):
+            ends = []
+            for side in (push, -push):
+                pin.framesForwardKinematics(engine, data, pin.integrate(engine, q, side))
+                ends.append(data.oMf[tip].translation.copy())
+            np.testing.assert_allclose(by_force[j], -(ends[0] - ends[1]) / (2 * H), atol=1e-7)
 
 
 def test_slopes_are_linear_in_bodies_that_may_be_none(ur5, rng):

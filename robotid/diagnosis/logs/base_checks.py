@@ -1,21 +1,36 @@
 """Checks of a floating base and of contacts: pose, twist, IMU, measured forces, feet that move."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
 from robotid.base.exceptions import DataError
 from robotid.base.findings import Finding
 from robotid.base.text import seconds
+from robotid.base.tolerances import LEAST_DIVISOR
 from robotid.base.typing import Array
-from robotid.data.base_motion import LEVEL, ImuFrame, base_state, in_base, pose_jumps
+from robotid.data.base_motion import (
+    GYROSCOPE_NOISE,
+    LEVEL,
+    ImuFrame,
+    base_state,
+    in_base,
+    pose_jumps,
+)
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import AGREES, BETTER, DIFFERS
+from robotid.diagnosis.decisions import (
+    AGREES,
+    BETTER,
+    BEYOND_NOISE,
+    DIFFERS,
+    NO_ERROR_OF_MASSES,
+    NOTHING,
+    ROWS,
+)
 from robotid.dynamics.constraint_rows import (
     constraint_jacobian,
     force_basis,
@@ -25,29 +40,16 @@ from robotid.dynamics.constraint_rows import (
 from robotid.dynamics.prepared_logs import closed_log, with_contacts
 from robotid.dynamics.torque import predict
 from robotid.robot.constraints import Contact, link_positions
-from robotid.robot.model import RobotModel
+from robotid.robot.model import GRAVITY, RobotModel
 
-_MOST = 1000  # samples at which poses and forces are compared
-_MOVES = 5e-3  # [m/s] speed of feet on the ground below which they are at rest
-_SLIDES = 0.1  # [m/s] RMS speed of a foot in contact above which it is reported ...
-_STANDS = 0.3  # ... if it is above this share of its speed without contact, or without rolling
-_LOADED = 0.1  # of the largest measured force: a foot with more is on the ground
-_ALIKE = (0.6, 1.6)  # factors of the forces that a wrong URDF explains
-_FORCE_UNITS = {"kN": 1e3, "kgf": 9.81}
-_SLOWER = 0.65  # ratio of speeds below which another pose explains the motion
-_SIMPLER = 1.2  # factor by which each further change of a pose must reduce the speed ...
-# [m/s or rad/s] ... plus this noise, the RMS value from which velocities are compared
-_NOISE = 1e-3
-_UNLIKE = 0.3  # of the motion or weight: difference of a wrong velocity or force
-_DEGREES = np.pi / 180
-_UNITS = {"linear": ("mm/s", 1e-3), "angular": ("deg/s", _DEGREES)}
-_BACK = np.array([-1.0, -1.0, -1.0, 1.0])  # signs of the inverse quaternion
-_ABOVE = 0.3  # vertical distance of base and feet over their distance, from which one is above
-_ALONG = 0.8  # component of the unit vector from the feet to the base that may be the vertical
+_G = float(np.linalg.norm(GRAVITY))  # [m/s^2]
+_REST = 5e-3  # [m/s or rad/s] speed of a foot or base at rest, and noise of compared velocities
+_SLIDES = 0.1  # [m/s] RMS speed of a foot in contact above which it is reported
 _STRIDE = 0.2  # [s] over which the acceleration of a base is averaged
-_FASTEST = 30.0  # [m/s^2] RMS value of it above which the position is in mm
-_IMU_MOVES = 0.1  # [rad/s] RMS from which angular velocities are compared
-_TILT = 8.0  # [deg] largest angle of the mean specific force from the vertical
+_DEGREES = np.pi / 180
+_UNITS = {"linear": ("m/s", "mm/s", 1e-3), "angular": ("rad/s", "deg/s", _DEGREES)}
+_PARTS = {"linear": slice(0, 3), "angular": slice(3, 6)}  # of a twist
+_BACK = np.array([-1.0, -1.0, -1.0, 1.0])  # signs of the inverse quaternion
 
 
 def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator[Finding]:
@@ -77,7 +79,6 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
         return
     for note in whole.notes[len(log.notes) :]:
         yield finding("log_note", log.name, text=note)
-    flags = _flags(model, log, whole, motion.t)
     wrong = [] if imu is None else list(check_imu(whole, motion))
     yield from wrong
     is_turned = any(one.code in ("imu_axes", "base_orientation") for one in wrong)
@@ -85,26 +86,15 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
         return
     if not wrong:
         yield from check_wrenches(model, log.name, motion)
-    yield from _check_feet(model, log, motion, flags)
-
-
-def _flags(model: RobotModel, log: Log, whole: Log, t: Array) -> Array:
-    """Return whether each contact of a log is in contact at times, shape (N, contacts), bool."""
-    flags = np.ones((len(t), len(model.contacts)), dtype=bool)
-    for k, contact in enumerate(model.contacts):
-        if contact.is_measured:
-            flags[:, k] = _loaded(contact, log, t)
-        elif not contact.always and contact.frame in whole.contacts:
-            flags[:, k] = _at(whole.contacts[contact.frame], whole, t)
-    return flags
+    yield from _check_feet(model, log, whole, motion)
 
 
 def check_wrenches(model: RobotModel, log: str, motion: Trajectory) -> Iterator[Finding]:
     """Yield a finding if measured forces have another sign or unit."""
-    # W pi = J^T f in the rows of a floating base, less unknown forces; the best factor is not 1.
+    # W pi = J^T f in the rows of a floating base, less unknown forces, is clearly better fulfilled.
     if motion.wrenches is None or not any(x.measured for x in model.contacts):
         return
-    every = max(1, len(motion.t) // _MOST)
+    every = max(1, len(motion.t) // ROWS)
     wrenches, motion = motion.wrenches[::every], motion.every(every)
     (torque,) = predict(model, [model.standard_parameters()], motion)
     g = float(np.linalg.norm(model.pin_model.gravity.linear))
@@ -112,16 +102,14 @@ def check_wrenches(model: RobotModel, log: str, motion: Trajectory) -> Iterator[
     J, basis = _base_rows(model, motion)
     caused = without_forces(basis, np.einsum("kmj,km->kj", J, wrenches))
     left = without_forces(basis, torque[:, :6])
-    square = float(np.sum(caused**2))
-    factor = float(np.sum(caused * left)) / square if square > 0.0 else 1.0
-    if _ALIKE[0] <= factor <= _ALIKE[1]:
-        return
-    units = (x for x, unit in _FORCE_UNITS.items() if _ALIKE[0] < factor / unit < _ALIKE[1])
-    what = next(units, "unit")
-    if abs(factor + 1.0) < 1.0 - _ALIKE[0]:
-        factor, what = -1.0, "reversed"
-    stated, best = (rms((left - x * caused)[:, :3]) for x in (1.0, factor))
-    if stated > _UNLIKE * weight and best < BETTER * stated:
+    factor = float(np.sum(caused * left)) / max(float(np.sum(caused**2)), NOTHING)
+    factors = {"reversed": -1.0, "kN": 1e3, "kgf": _G, "unit": factor}
+    errors = {what: rms((left - x * caused)[:, :3]) for what, x in factors.items()}
+    stated = rms((left - caused)[:, :3])
+    what = next((key for key, error in errors.items() if error < BETTER * stated), "")
+    if what and stated > BETTER * weight:
+        at = what if what == "reversed" else "unit"
+        best, factor = errors[at], factors[at]
         yield finding("measured_wrench", log, what=what, force=stated, best=best, factor=factor)
 
 
@@ -137,8 +125,15 @@ def _base_rows(model: RobotModel, motion: Trajectory) -> tuple[Array, Array]:
     return J[:, known], force_basis(np.delete(J, known, axis=1), used, floats=True)
 
 
-def _check_feet(model: RobotModel, log: Log, motion: Trajectory, flags: Array) -> Iterator[Finding]:
+def _check_feet(model: RobotModel, log: Log, whole: Log, motion: Trajectory) -> Iterator[Finding]:
     """Yield findings on the motion of each link in contact."""
+    flags = np.ones((len(motion.t), len(model.contacts)), dtype=bool)
+    rows = np.searchsorted(whole.t, motion.t + 1e-9, side="right").clip(1) - 1  # the last ones
+    for k, contact in enumerate(model.contacts):
+        if contact.is_measured:
+            flags[:, k] = False
+        elif not contact.always and contact.frame in whole.contacts:
+            flags[:, k] = whole.contacts[contact.frame][rows]
     J, turn = _contact_jacobian(model, motion.q)
     velocity = np.einsum("kcij,kj->kci", J, motion.v)  # (N, contacts, 3) [m/s]
     has_ground = log.base is None or log.base.has_position
@@ -148,11 +143,9 @@ def _check_feet(model: RobotModel, log: Log, motion: Trajectory, flags: Array) -
         velocity = (velocity - np.nanmedian(standing, axis=1)[:, None]) * pairs
     squares = np.sum(velocity**2, axis=2)
     for k, contact in enumerate(model.contacts):
-        always = np.ones(len(log.t), dtype=bool)
-        stated = always if contact.always else log.contacts.get(contact.frame)
-        if stated is None or contact.is_measured:  # found from this motion, or not needed
-            continue
-        touches, link = _at(stated, log, motion.t), contact.frame
+        touches, link = flags[:, k], contact.frame
+        if not (contact.always or link in log.contacts) or contact.is_measured:
+            continue  # found from this motion, or not needed
         if contact.kind == "point" and has_ground:
             w = np.einsum("kij,kj->ki", turn[:, k], motion.v)
             rolls = np.column_stack([w[:, 1], -w[:, 0], 0.0 * w[:, 2]])  # v / radius
@@ -165,22 +158,8 @@ def _check_feet(model: RobotModel, log: Log, motion: Trajectory, flags: Array) -
                 continue
         both = (squares[at, k] for at in (touches, ~touches))
         in_contact, apart = (float(np.sqrt(x.mean())) if len(x) else np.inf for x in both)
-        if _SLIDES < in_contact < np.inf and (in_contact > _STANDS * apart or touches.all()):
+        if _SLIDES < in_contact < np.inf and (in_contact > BETTER * apart or touches.all()):
             yield finding("moving_contact", log.name, subject=link, link=link, speed=in_contact)
-
-
-def _at(flags: Array, log: Log, t: Array) -> Array:
-    """Return flags at other times: those of the last row."""
-    rows = np.searchsorted(log.t, t + 1e-9, side="right") - 1
-    return np.asarray(flags[rows.clip(0, len(flags) - 1)])
-
-
-def _loaded(contact: Contact, log: Log, t: Array) -> Array:
-    """Return whether the measured force of a contact is not small, shape (N,), bool."""
-    forces = [part for part in contact.measured if part.startswith("f")]
-    parts = [log.wrenches[f"{part} {contact.frame}"] for part in forces]
-    size = np.linalg.norm(parts, axis=0)
-    return _at(size > _LOADED * size.max(), log, t)
 
 
 def _contact_jacobian(model: RobotModel, q: Array) -> tuple[Array, Array]:
@@ -198,20 +177,17 @@ def _contact_jacobian(model: RobotModel, q: Array) -> tuple[Array, Array]:
 def _radius(stated: float, v: Array, rolls: Array) -> tuple[float, float, float] | None:
     """Return the radius of a foot in contact that rolls as a ball of another one than stated."""
     # With the median speeds with the stated radius and with it.
-    if not rolls.any():
-        return None
-    # weighted median of v / roll: the smallest sum of |v - change roll|, samples that slip apart
     u, along = rolls[:, :2].ravel(), v[:, :2].ravel()
     u, along = u[u != 0.0], along[u != 0.0]
-    ratio = along / u
-    order = np.argsort(ratio)
-    weight = np.cumsum(np.abs(u)[order])
-    change = float(ratio[order][np.searchsorted(weight, 0.5 * weight[-1])])
+    if not len(u):
+        return None
+    # weighted median of v / roll: the smallest sum of |v - change roll|, samples that slip apart
+    change = float(np.quantile(along / u, 0.5, weights=np.abs(u), method="inverted_cdf"))
     before, after = (
         float(np.median(np.linalg.norm(v[:, :2] - x * rolls[:, :2], axis=1))) for x in (0.0, change)
     )
     radius = stated + change
-    if radius <= 0.0 or before < _MOVES or after > _STANDS * before:
+    if radius <= 0.0 or before < _REST or after > BETTER * before:
         return None
     return radius, before, after
 
@@ -239,7 +215,7 @@ def check_unit(log: Log) -> Iterator[Finding]:
     if len(t) < 3:
         return
     size = rms(np.diff(x, n=2, axis=0) / _STRIDE**2)
-    if size >= _FASTEST:
+    if size >= NO_ERROR_OF_MASSES * _G:
         yield finding("base_unit", log.name, acceleration=size, stride=_STRIDE, if_mm=1e-3 * size)
 
 
@@ -254,43 +230,60 @@ def check_twist(log: Log, signals: SignalSettings) -> Iterator[Finding]:
         motion = process(replace(log, v=np.zeros_like(log.q)), settings)
     except DataError:  # too short: raised again when the log is read
         return
-    place, quaternion, twist = motion.q[:, :3], motion.q[:, 3:7], motion.v[:, :6]
-
-    def of_pose(quaternion: Array) -> Array:
-        return base_state(motion.t, np.hstack([place, quaternion]), None, None)[1]
-
-    wanted = of_pose(quaternion)
-    readings = {key: of_pose(q) for key, q in orientation_readings(quaternion).items()}
-    read = {"logged": twist, "world": _turned(quaternion, twist)}
-    read |= {"base": _turned(quaternion * _BACK, twist)}
-    parts = {"linear": slice(0, 3), "angular": slice(3, 6)}
-    axes = {
-        what: {key: rms((x - wanted)[:, part]) for key, x in read.items()}
-        for what, part in parts.items()
-    }
-    for (what, part), other in zip(parts.items(), ("angular", "linear"), strict=True):
-        unit, (logged_unit, factor) = "m/s" if what == "linear" else "rad/s", _UNITS[what]
-        size, off = rms(wanted[:, part]), axes[what]["logged"]
-        causes = {key: axes[what][key] for key in ("world", "base")}
-        causes["unit"] = rms(factor * twist[:, part] - wanted[:, part])
-        turned = {key: rms((twist - x)[:, part]) for key, x in readings.items()}
-        best, cause = min((left, key) for key, left in (causes | turned).items())
-        is_explained = best < BETTER * off
-        if size < _NOISE or off < (AGREES if is_explained else _UNLIKE) * size:
-            continue
-        figures: dict[str, Any] = {"size": size, "best": best, "what": what, "unit": unit}
-        if is_explained and cause in turned:
-            yield finding(
-                "base_orientation", log.name, source="twist", reading=cause, cure=cause, turn=False,
-                speed=off, **figures,
-            )  # fmt: skip
+    quaternion, twist = motion.q[:, 3:7], motion.v[:, :6]
+    read = {"world": _turned(quaternion, twist), "base": _turned(quaternion * _BACK, twist)}
+    read["unit"] = twist * np.repeat([factor for *_, factor in _UNITS.values()], 3)
+    errors = _velocity_errors(motion, read)
+    for what, other in zip(errors, reversed(errors), strict=True):
+        size, off = errors[what]
+        cause = _cause(size, off, _REST)
+        if cause in orientation_readings(quaternion):
+            yield _misread(log.name, what, cause, size, off)
             return
-        yield finding(
-            "base_twist", log.name, cure=cause if is_explained else "unknown", off=off,
-            mixed=is_explained and cause == "world"
-            and axes[other]["logged"] < BETTER * axes[other]["world"],
-            other=other, logged_unit=logged_unit, off_world=axes[what]["world"], **figures,
-        )  # fmt: skip
+        unit, logged_unit, _ = _UNITS[what]
+        others = errors[other][1]
+        if cause:
+            yield finding(
+                "base_twist", log.name, cure=cause, off=off["logged"], size=size, what=what,
+                mixed=cause == "world" and others["logged"] < BETTER * others["world"],
+                other=other, unit=unit, logged_unit=logged_unit, off_world=off["world"],
+                best=min(off.values()),
+            )  # fmt: skip
+
+
+def _velocity_errors(
+    motion: Trajectory, read: dict[str, Array]
+) -> dict[str, tuple[float, dict[str, float]]]:
+    """Return the RMS velocity of the pose, and by reading how far the measured one is from it."""
+    place, quaternion, twist = motion.q[:, :3], motion.q[:, 3:7], motion.v[:, :6]
+    of_pose = {
+        key: base_state(motion.t, np.hstack([place, q]), None, None)[1]
+        for key, q in {"logged": quaternion, **orientation_readings(quaternion)}.items()
+    }
+    left = {key: twist - v for key, v in of_pose.items()}
+    left |= {key: v - of_pose["logged"] for key, v in read.items()}
+    return {
+        what: (rms(of_pose["logged"][:, part]), {key: rms(x[:, part]) for key, x in left.items()})
+        for what, part in _PARTS.items()
+    }
+
+
+def _cause(size: float, off: dict[str, float], noise: float) -> str:
+    """Return the reading with which a velocity is that of the pose, or "unknown"; "": as logged."""
+    # A velocity that is wrong does not agree with the pose better than with rest.
+    best, cause = min((error, key) for key, error in off.items())
+    is_explained = best < BETTER * off["logged"]
+    if size < noise or off["logged"] < (AGREES if is_explained else BETTER) * size:
+        return ""
+    return cause if is_explained else "unknown"
+
+
+def _misread(log: str, what: str, cause: str, size: float, off: dict[str, float]) -> Finding:
+    """Return the finding that a measured velocity shows another reading of the quaternion."""
+    return finding(
+        "base_orientation", log, source="velocity", reading=cause, cure=cause, turn=False,
+        what=what, unit=_UNITS[what][0], size=size, speed=off["logged"], best=off[cause],
+    )  # fmt: skip
 
 
 def _turned(quaternion: Array, twist: Array) -> Array:
@@ -304,95 +297,70 @@ def orientation_readings(quaternion: Array) -> dict[str, Array]:
     return {"order": order, "inverse": quaternion * _BACK, "both": order * _BACK}
 
 
-@dataclass(frozen=True, eq=False)
-class _Feet:
-    """Contacts and base at n samples, to try other poses of the base."""
-
-    t: Array  # (N,) [s], times of all samples
-    every: int  # of them is one of the n
-    x: Array  # (n, k, 3), places of the contacts in the base [m]
-    dx: Array  # (n, k, 3), their time derivative [m/s]
-    dp: Array | None  # (n, 3), velocity of the base [m/s]; None if its place was not recorded
-
-    def turned(self, quaternion: Array) -> tuple[Array, Array]:
-        """Return the orientation (n, 3, 3) of quaternions (N, 4), and its time derivative."""
-        R = np.stack([in_base(quaternion, axis) for axis in np.eye(3)], axis=1)
-        return R[:: self.every], np.gradient(R, self.t, axis=0)[:: self.every]
-
-    def speed(self, pose: tuple[Array, Array]) -> float:
-        """Return the mean speed of the slowest contact of each sample [m/s]."""
-        # Without a place of the base it is that of the slowest pair, relative to each other.
-        R, dR = pose
-        v = self.x @ dR.swapaxes(1, 2) + self.dx @ R.swapaxes(1, 2)  # (n, k, 3)
-        if self.dp is not None:
-            v += self.dp[:, None]
-        else:
-            first, second = np.triu_indices(v.shape[1], 1)
-            v = v[:, first] - v[:, second]
-        slowest = np.linalg.norm(v, axis=2).min(axis=1, initial=np.inf)
-        return float(slowest.mean()) if v.shape[1] else 0.0
-
-    def upwards(self, R: Array) -> Array:
-        """Return the mean unit vector from the contacts to the base, shape (3,)."""
-        x = self.x / np.linalg.norm(self.x, axis=2, keepdims=True).clip(1e-9)
-        return np.asarray(-(x @ R.swapaxes(1, 2)).mean(axis=(0, 1)))
-
-
 def check_order(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[Finding]:
     """Yield a finding if feet on the ground hardly move with another reading of the quaternion."""
-    # The slowest foot of each sample is on the ground, whatever its flags; without position, feet
-    # hardly move relative to each other. The base is above the feet, along any axis of the world. A
-    # constant tilt moves no foot, and looks like a slope: it is not found.
+    # Each change of the pose must clearly reduce the speed. The base is above the feet, along any
+    # axis of the world. A constant tilt moves no foot, and looks like a slope: it is not found.
     if log.base is None or not model.contacts or len(motion.t) < 3:
         return
     frames = [x.frame for x in model.contacts]
-    places = link_positions(model.pin_model, model.configurations(motion.q), frames)
-    q, p = motion.q[:, 3:7], motion.q[:, :3]
-    off = places - p[:, None]
-    x = np.stack([in_base(q, off[:, k]) for k in range(len(frames))], axis=1)
-    every = max(1, len(q) // _MOST)
-    dx, dp = (np.gradient(y, motion.t, axis=0)[::every] for y in (x, p))
-    feet = _Feet(motion.t, every, x[::every], dx, dp if log.base.has_position else None)
+    p, q = motion.q[:, :3], motion.q[:, 3:7]
+    off = link_positions(model.pin_model, model.configurations(motion.q), frames) - p[:, None]
+    x = [in_base(q, off[:, k]) for k in range(len(frames))]  # places of the feet in the base
     gravity = np.asarray(model.pin_model.gravity.linear)
-    up, stated = -gravity / (float(np.linalg.norm(gravity)) or 1.0), feet.turned(q)
-    mean, speed = feet.upwards(stated[0]), feet.speed(stated)
-    height, is_moving = float(mean @ up), speed >= _MOVES
-    slower: list[tuple[float, float, str, str]] = []  # rank, speed, reading, gravity
-    tried = orientation_readings(q) if is_moving or height <= -_ABOVE else {}
-    for key, quaternion in tried.items():
-        pose = feet.turned(quaternion)
-        moves, direction = feet.speed(pose), feet.upwards(pose[0])
-        is_above, is_slow = direction @ up >= _ABOVE, is_moving and moves < _SLOWER * speed
-        is_turned_back = height < -_ABOVE and is_above and moves < speed + _MOVES
-        remedy = "" if is_above else _vertical(direction, gravity)
-        if (is_slow or is_turned_back) and remedy is not None:
-            changes = (key == "both") + bool(remedy)
-            slower.append(((moves + _NOISE) * _SIMPLER**changes, moves, key, remedy))
-    if slower:
-        _, best, key, remedy = min(slower, key=lambda x: x[0])
+    g = float(np.linalg.norm(gravity)) or 1.0
+    readings = list[tuple[float, str, float, Array | None, Array]]()
+    for key, quaternion in {"": q, **orientation_readings(q)}.items():
+        feet = np.stack([in_base(quaternion * _BACK, x_k) for x_k in x], axis=1)  # beside the base
+        speed = _slowest(motion.t, feet + p[:, None], log.base.has_position)
+        middle = -feet.mean(axis=1)
+        length = np.linalg.norm(middle, axis=1, keepdims=True).clip(LEAST_DIVISOR)
+        direction = (middle / length).mean(axis=0)
+        up = _vertical(direction, -gravity / g)
+        if up is None and key:
+            continue
+        up = None if up is None or up @ gravity <= -BETTER * g else up
+        changes = bool(key) + (key == "both") + (up is not None)
+        readings.append(((speed + _REST) / BETTER**changes, key, speed, up, direction))
+    _, key, best, up, _ = min(readings, key=lambda reading: reading[0])
+    _, _, speed, _, stated = readings[0]
+    height, remedy = -float(stated @ gravity) / g, ""
+    if up is not None:
+        remedy = f"gravity = [{', '.join(f'{-g * x_k + 0.0:g}' for x_k in up)}]"
+    if key:
         yield finding(
             "base_orientation", log.name, source="feet", reading=key, cure=key, speed=speed,
-            best=best, side=height < -_ABOVE, turn=bool(remedy), gravity=remedy,
+            best=best, side=height < 0.0, turn=bool(remedy), gravity=remedy,
         )  # fmt: skip
-    elif height < _ABOVE and (remedy := _vertical(mean, gravity)) is not None:
-        mean = mean / np.linalg.norm(mean)
-        k = int(np.argmax(np.abs(mean)))
+    elif up is not None:
+        k = int(np.argmax(np.abs(up)))
         yield finding(
             "base_orientation", log.name, source="vertical", cure="vertical", turn=False,
-            axis=("-" if mean[k] < 0 else "") + "xyz"[k], gravity=remedy, height=float(mean @ up),
-            best=abs(mean[k]),
+            axis=("-" if up[k] < 0 else "") + "xyz"[k], gravity=remedy, height=height,
+            best=float(up @ stated) / float(np.linalg.norm(stated)),
         )  # fmt: skip
 
 
-def _vertical(direction: Array, gravity: Array) -> str | None:
-    """Return the setting of gravity along the axis of a direction upwards; None without one."""
+def _slowest(t: Array, feet: Array, has_position: bool) -> float:
+    """Return the mean speed of the slowest foot at each time [m/s]: feet (N, k, 3) [m]."""
+    # It is on the ground, whatever its flags. Without position: of the slowest pair.
+    v: Array = np.gradient(feet, t, axis=0)
+    if not has_position:
+        first, second = np.triu_indices(v.shape[1], 1)
+        v = v[:, first] - v[:, second]
+    slowest = np.linalg.norm(v, axis=2).min(axis=1, initial=np.inf)
+    return float(slowest.mean()) if v.shape[1] else 0.0
+
+
+def _vertical(direction: Array, up: Array) -> Array | None:
+    """Return the stated vertical or the axis of the world along a direction; None without one."""
     # The mean direction of a base that rolls over is short: it has none.
+    if direction @ up >= BETTER:
+        return up
+    axis = np.zeros(3)
     k = int(np.argmax(np.abs(direction)))
-    if np.abs(direction[k]) < max(_ABOVE, _ALONG * float(np.linalg.norm(direction))):
-        return None
-    wanted = [0.0, 0.0, 0.0]
-    wanted[k] = -float(np.copysign(np.linalg.norm(gravity), direction[k]))
-    return f"gravity = [{', '.join(f'{x:g}' for x in wanted)}]"
+    axis[k] = np.sign(direction[k])
+    return axis if np.linalg.norm(direction - axis) < BETTER else None
 
 
 def rms(values: Array) -> float:
@@ -404,49 +372,30 @@ def check_imu(log: Log, motion: Trajectory) -> Iterator[Finding]:
     """Yield findings on the IMU of one log."""
     if log.base is None or log.base.imu is None or motion.t[-1] - motion.t[0] < LEVEL:
         return
-    yield from _check_gyroscopes(log, motion)
+    read = {"unit": _DEGREES * motion.v[:, :6]}
+    size, off = _velocity_errors(motion, read)["angular"]
+    cause = _cause(size, off, BEYOND_NOISE * GYROSCOPE_NOISE)
+    if cause in orientation_readings(motion.q[:, 3:7]):
+        yield _misread(log.name, "angular", cause, size, off)
+    elif cause:
+        share, best = off["logged"] / size, min(off.values()) / size
+        yield finding("imu_axes", log.name, off=share, best=best, cure=cause)
     yield from _check_gravity(log, log.base.imu.frame, motion)
-
-
-def _check_gyroscopes(log: Log, motion: Trajectory) -> Iterator[Finding]:
-    """Yield a finding if the angular velocity is not that of the orientation."""
-    w, place, quaternion = motion.v[:, 3:6], motion.q[:, :3], motion.q[:, 3:7]
-
-    def off(x: Array, q: Array = quaternion) -> float:
-        return rms(x - base_state(motion.t, np.hstack([place, q]), None, None)[1][:, 3:])
-
-    now, size = off(w), off(0.0 * w)
-    if rms(w) < _IMU_MOVES or now <= _UNLIKE * size:
-        return
-    readings = {key: off(w, q) for key, q in orientation_readings(quaternion).items()}
-    key, degrees = min(readings, key=lambda x: readings[x]), off(_DEGREES * w)
-    if readings[key] <= _UNLIKE * size:
-        yield finding(
-            "base_orientation", log.name, source="imu", reading=key, cure=key, turn=False,
-            speed=now, best=readings[key],
-        )  # fmt: skip
-        return
-    cure = "degrees" if degrees < BETTER * now else "unknown"
-    yield finding("imu_axes", log.name, off=now / size, best=min(degrees, now) / size, cure=cure)
 
 
 def _check_gravity(log: Log, frame: ImuFrame, motion: Trajectory) -> Iterator[Finding]:
     """Yield a finding if the mean specific force in the world is not opposite to gravity."""
     quaternion, v, a = motion.q[:, 3:7], motion.v, motion.a
     f = a[:, :3] + np.cross(v[:, 3:6], v[:, :3]) - in_base(quaternion, frame.gravity)
-    mean = in_base(quaternion * _BACK, f).mean(axis=0)
     g = float(np.linalg.norm(frame.gravity))
+    mean, up = in_base(quaternion * _BACK, f).mean(axis=0) / g, -frame.gravity / g
     size = float(np.linalg.norm(mean))
-    cosine = -float(mean @ frame.gravity) / max(g * size, 1e-12)
-    angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    if angle < _TILT and abs(size / g - 1.0) < DIFFERS:
-        return
-    causes = {
-        "units": abs(size - 1.0) < DIFFERS,
-        "subtracted": size < 0.5 * g,
-        "reversed": angle > 180.0 - _TILT,
-        "scale": angle < _TILT,
-        "axes": True,
-    }
-    cause = next(key for key, holds in causes.items() if holds)
-    yield finding("imu_gravity", log.name, cause_of=cause, angle=angle, size=size, wanted=g)
+    along = mean / max(size, LEAST_DIVISOR)
+    read = {
+        "right": mean, "units": g * mean, "subtracted": mean + up, "reversed": -mean,
+        "scale": along, "axes": up,
+    }  # fmt: skip
+    cause = next(key for key, x in read.items() if np.linalg.norm(x - up) < DIFFERS)
+    if cause != "right":
+        angle = float(np.degrees(np.arccos(np.clip(along @ up, -1.0, 1.0))))
+        yield finding("imu_gravity", log.name, cause_of=cause, angle=angle, size=g * size, wanted=g)

@@ -1,4 +1,4 @@
-"""Readings of recordings and the URDF: offsets, scales, a clock, gravity, origins of joints.
+"""Readings of recordings and the URDF: offsets, scales, clocks, gravity, forces, joints' places.
 
 Other masses cannot imitate any of these: each changes the predicted torque tau(q, v, a) in its own
 way. To first order, in all joints together,
@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from scipy.interpolate import BSpline
 
 from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
@@ -22,12 +23,22 @@ from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.residual.misfit import Misfit, find_misfits
 from robotid.diagnosis.residual.term_trials import Accepted, Sample, Trials, along
-from robotid.dynamics.torque import body_slopes, drive_torque, inverse_dynamics
+from robotid.dynamics.torque import (
+    TorqueSlopes,
+    body_slopes,
+    drive_torque,
+    force_slopes,
+    inverse_dynamics,
+    is_loaded,
+    torque_rate,
+)
 from robotid.estimation.fitting.fitted import Fit
-from robotid.robot.model import RobotModel
+from robotid.robot.model import GRAVITY, RobotModel
 
 _STEP = 1e-5  # step of a finite difference [-, rad or m]
 _STEPS = 5  # Gauss-Newton steps of a size
+_SPLINES = 40  # largest number of B-splines in time ...
+_BLOCKS = 3  # ... and blocks that are held out, of one of them
 _Altered = tuple[RobotModel, Sequence[Trajectory]]
 
 
@@ -42,44 +53,46 @@ class Reading:
     columns: Callable[[Array], Array]
     #: Robot and motions with sizes (c,), where torques are nonlinear in them.
     applied: Callable[[Array, Array], _Altered] | None = None
+    changes: bool = False  # whether its sizes change in time
 
 
 def readings(model: RobotModel, pi: Array, sample: Sample) -> tuple[Reading, ...]:
     """Return the readings that are tried, an entry each."""
-    n, joints, at = len(model.joints), model.joints, sample.at
+    of_motions = [body_slopes(model, pi, motion) for motion in sample.at]
+    by = TorqueSlopes(*map(np.concatenate, zip(*of_motions, strict=True)))
+    return *_of_recordings(model, pi, sample, by), *_of_robot(model, pi, sample, by)
+
+
+def _of_recordings(
+    model: RobotModel, pi: Array, sample: Sample, by: TorqueSlopes
+) -> tuple[Reading, ...]:
+    """Return the readings of positions, torques and time."""
+    joints, at = model.joints, sample.at
     tau, of_drives = _torques(model, pi, at), _drives(model, pi, at)
-    bodies = np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
-    still = [replace(m, v=0.0 * m.v, a=0.0 * m.a) for m in at]
-    inertial = tau - of_drives - _torques(model, bodies, still)
-    of_motions = [body_slopes(model, pi, motion) for motion in at]
-    *by_motion, by_gravity, by_origin = map(np.concatenate, zip(*of_motions, strict=True))
+    inertial = tau - of_drives - _torques(model, _bodies(model, pi), _still(at))
+    of_bodies = (by.by_q, by.by_v, by.by_a)
+    by_motion = [D + _drive_slopes(model, pi, at, x) for D, x in zip(of_bodies, "qva", strict=True)]
     q, v, a = (np.concatenate([getattr(m, key) for m in at]) for key in "qva")
+    recorded = zip(sample.recordings, sample.taken, strict=True)
+    jerk = np.concatenate([torque_rate(x.trajectory.a, x.trajectory)[k] for x, k in recorded])
     direction = np.column_stack([motion.direction for motion in sample.motions])
-    down = np.array(model.pin_model.gravity.linear)
-    across = np.linalg.norm(down) * np.linalg.svd(down[None])[2][1:]  # (2, 3)
+
+    def changed(*motion: Array) -> Array:
+        """Return the change of the torques with that of positions, velocities, accelerations."""
+        parts = zip(by_motion, motion, strict=True)
+        return np.asarray(sum(D @ x[..., None] for D, x in parts))
 
     def moved(scale: Array, shift: Array) -> Array:
         """Return the derivative of the torques for positions (1 + e scale) q + e shift by e."""
-        factor = 1.0 + _STEP * scale
-        change = [
-            replace(m, q=factor * m.q + _STEP * shift, v=factor * m.v, a=factor * m.a) for m in at
-        ]
-        Z: Array = (_drives(model, pi, change) - of_drives)[..., None] / _STEP
-        for D, x in zip(by_motion, (scale * q + shift, scale * v, scale * a), strict=True):
-            Z += D @ x[..., None]
-        return Z
+        return changed(scale * q + shift, scale * v, scale * a)
 
     def offset(on: Array, x: Array) -> _Altered:
         return model, [replace(m, q=m.q + x * on) for m in at]
 
-    def tilted(on: Array, x: Array) -> _Altered:
-        g = down + x @ across  # by angles with these tangents
-        return model.with_gravity(g * np.linalg.norm(down) / np.linalg.norm(g)), at
-
+    late = -changed(v, a, jerk)  # (N, n, 1)
     one, every = [(joint,) for joint in joints], [tuple[str, ...]()]
-    level = every if down.any() else []
     driven = [(joint,) for joint, size in zip(joints, sample.torque, strict=True) if size]
-    wrists = [joints[first:] for first in range(1, n - 1)]  # whose drives are of the same type
+    wrists = [joints[first:] for first in range(1, len(joints) - 1)]  # with drives of one type
     return (
         Reading("position_offset", 0.01, one, lambda on: moved(0 * on, on), offset),
         Reading(
@@ -89,12 +102,70 @@ def readings(model: RobotModel, pi: Array, sample: Sample) -> tuple[Reading, ...
         Reading("angle_scale", 0.02, one + every, lambda on: moved(on, 0 * on)),
         Reading("torque_scale", 0.05, driven + wrists, lambda on: (tau * on)[..., None]),
         Reading("time_scale", 0.04, every, lambda on: inertial[..., None]),
-        Reading("gravity", 0.05, level, lambda on: by_gravity @ across.T, tilted),
+        Reading("joint_delay", 0.003, one, lambda on: late * on[:, None]),
+    )  # fmt: skip
+
+
+def _of_robot(
+    model: RobotModel, pi: Array, sample: Sample, by: TorqueSlopes
+) -> tuple[Reading, ...]:
+    """Return the readings of gravity, forces and the places of joints."""
+    at, shape = sample.at, (len(by.by_q), len(model.joints), -1)
+    down = np.array(model.pin_model.gravity.linear)
+    g = float(np.linalg.norm(down))
+    across = g * np.linalg.svd(down[None])[2][1:]  # (2, 3)
+
+    def tilted(on: Array, x: Array) -> _Altered:
+        other = down + x @ across  # by angles with these tangents
+        return model.with_gravity(other * g / np.linalg.norm(other)), at
+
+    def weighed(on: Array) -> Array:
+        # of the URDF's masses: those of the fit may have adapted to a base that moves
+        bodies, still = _bodies(model, model.standard_parameters()), _still(at)
+        pulled = [_torques(model.with_gravity(axis), bodies, still) for axis in g * np.eye(3)]
+        return np.stack(pulled, axis=2)
+
+    def push(on: Array) -> Array:
+        return np.concatenate([force_slopes(model, motion) for motion in at])
+
+    one, every = [(joint,) for joint in model.joints], [tuple[str, ...]()]
+    level = every if down.any() else []
+    least = 0.02 * float(np.linalg.norm(GRAVITY)) * pi[: model.layout.n_inertial : 10].sum()
+    return (
+        Reading("gravity", 0.025, level, lambda on: by.by_gravity @ across.T, tilted),
+        Reading("moving_gravity", 0.025, level, lambda on: g * by.by_gravity, changes=True),
+        Reading("moving_gravity", 0.025, level, weighed, changes=True),
+        Reading("external_force", least, every, push),
+        Reading("external_force", least, every, push, changes=True),
         Reading(
-            "joint_origin", 0.01, one + every,
-            lambda on: by_origin[:, :, on > 0].reshape(*tau.shape, -1),
+            "joint_origin", 0.01, one + every, lambda on: by.by_origin[:, :, on > 0].reshape(shape)
+        ),
+        Reading(
+            "axis_direction:residual", 0.03, one,
+            lambda on: by.by_axis[:, :, on > 0].reshape(shape),
         ),
     )  # fmt: skip
+
+
+def _still(at: Sequence[Trajectory]) -> list[Trajectory]:
+    """Return motions at rest."""
+    return [replace(m, v=0.0 * m.v, a=0.0 * m.a) for m in at]
+
+
+def _bodies(model: RobotModel, pi: Array) -> Array:
+    """Return standard parameters without drives, shape (p,)."""
+    return np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
+
+
+def _drive_slopes(model: RobotModel, pi: Array, at: Sequence[Trajectory], key: str) -> Array:
+    """Return the derivatives of the drives' torques by q, v or a of each joint, (N, n, n)."""
+    # Drives of their own joints only: all joints are moved together.
+    every, before = np.eye(len(model.joints)), _drives(model, pi, at)
+    is_plain = np.array_equal(model.layout.drive_ratios, every) and not is_loaded(model)
+    moves = every.sum(axis=0, keepdims=True) if is_plain else every
+    ends = [[replace(m, **{key: getattr(m, key) + _STEP * on}) for m in at] for on in moves]
+    D = np.stack([(_drives(model, pi, end) - before) / _STEP for end in ends], axis=2)
+    return D * every if is_plain else D
 
 
 def _torques(model: RobotModel, pi: Array, at: Sequence[Trajectory]) -> Array:
@@ -134,6 +205,7 @@ class _Alteration:
                 "cure": "residual",
             },
             "joint_origin": {"named": joint or "a joint"},
+            "external_force": {"what": "constant", "cure": "constant"},
         }
         more, applied = values.get(self.reading.code, {}), self.reading.applied
         if applied is not None:
@@ -153,8 +225,13 @@ def explain_residual(
     model = fit.model
     if sample is None or model.free_flyer or model.constraints or model.passive:
         return (), ()
+    table = readings(model, fit.standard, sample)
+    possible = alterations(model, [reading for reading in table if not reading.changes])
+    in_time = [reading for reading in table if reading.changes]
+    changing = tuple(_changing(model, sample, in_time, possible))
+    if changing:  # it imitates all other readings and terms
+        return (), changing
     misfits = find_misfits(sample)
-    possible = alterations(model, fit.standard, sample)
     altered_by = list(_accepted(fit, sample, possible))
     if misfits and altered_by:
         altered = np.concatenate([possible[alteration] for alteration, *_ in altered_by], axis=2)
@@ -184,14 +261,53 @@ def _left(sample: Sample, Z: Array) -> float:
     return float(left[: sample.fitted].sum())
 
 
-def alterations(model: RobotModel, pi: Array, sample: Sample) -> dict[_Alteration, Array]:
+def alterations(model: RobotModel, table: Sequence[Reading]) -> dict[_Alteration, Array]:
     """Return each reading for each of its groups of joints, and its columns (N, n, c)."""
     columns = {}
-    for reading in readings(model, pi, sample):
+    for reading in table:
         for joints in reading.groups:
             on = np.isin(model.joints, joints or model.joints).astype(float)
             columns[_Alteration(reading, joints, on)] = reading.columns(on)
     return columns
+
+
+def _changing(
+    model: RobotModel, sample: Sample, in_time: Sequence[Reading],
+    constant: Mapping[_Alteration, Array],
+) -> Iterator[Finding]:  # fmt: skip
+    """Yield gravity or a force that changes in time and explains most of a large residual."""
+    # Segments do not predict others: blocks shorter than a spline are held out. Three directions
+    # explain the torques of three joints by themselves.
+    n = len(sample.joints)
+    squares, driven = np.sum(sample.r[: sample.rows] ** 2, axis=0), sample.torque > 0
+    error = float(np.sqrt(np.max(squares[driven] / sample.torque[driven], initial=0.0)))
+    count = min(_SPLINES, sample.rows // (_BLOCKS * decisions.SHORTEST))
+    rows = count * _BLOCKS * decisions.SHORTEST
+    if n <= 3 or error < decisions.DIFFERS or count < decisions.SCATTERED:
+        return
+    folded, order = sample.in_blocks(rows, decisions.SHORTEST)
+    knots = np.pad(np.linspace(0.0, rows, count - 1), 2, "edge")
+    B = BSpline.design_matrix(order, knots, 2).toarray()  # (rows, count), quadratic
+    changing = alterations(model, in_time)
+    splines = {
+        (one, True): (Z[order, ..., None] * B[:, None, None]).reshape(rows, n, -1)
+        for one, Z in changing.items()
+    }
+    plain = {(one, False): Z[order] for one, Z in {**changing, **constant}.items()}
+    trials, offered = Trials.of(folded, splines | plain)
+    best = next(trials.accepted(offered, decisions.ALTERATION, lambda x: len(offered[x])), None)
+    if best is None or not best.option[1] or best.p_value > decisions.P_VALUE:
+        return
+    reading, share = best.option[0].reading, 100 * best.share
+    x = B @ best.theta.reshape(-1, count).T  # (rows, 3)
+    mean, variance = float(np.linalg.norm(x.mean(axis=0))), np.trace(best.covariance)
+    size = float(np.linalg.norm(np.std(x, axis=0)))
+    if share >= decisions.MAIN and size >= max(reading.least, mean):
+        yield finding(
+            reading.code, subject="all joints", severity="error", what="changes", cure="changes",
+            explained=False, size=size, std_error=np.sqrt(variance / count), share_pct=share,
+            angle=np.degrees(np.arctan(size)), error_pct=100 * error,
+        )  # fmt: skip
 
 
 def _accepted(

@@ -27,6 +27,7 @@ _STEEP = 8  # twice the order of the filter, which is applied in both directions
 _REVERSES = 0.05  # of the RMS value: width of a change of a coupling's direction or a gear's side
 _WINDUP = (0.02, 0.1)  # of the RMS displacement since a reversal: decay of a deflection
 _OF_POSITION = ("position_periodic", "spring", "position_offset")
+_OF_FORCE = ("gravity", "moving_gravity", "external_force")
 _OF_MASSES = ("current_for_torque", "urdf_mismatch")
 _DIGITS = "0123456789"
 
@@ -304,15 +305,20 @@ def settled(before: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Findin
         if hypotheses:
             codes = listed(dict.fromkeys(f.code for f in hypotheses))
             term = term.reworded(
-                severity="warning",
+                severity=max("warning", term.severity, key=("note", "warning", "error").index),
                 remedy=f"{term.remedy}. It explains {codes} and may bias the masses",
                 evidence={**term.evidence, "replaces": float(len(hypotheses))},
             )
         terms.append(term)
     # torques in another unit bind the bodies to a wrong prior, whose error looks like a term
     rescaled = {joint for f in rest if f.code == "current_for_torque" for joint in f.joints}
-    of_drives = [f for f in terms if f.code in codes_with("term") and rescaled.issuperset(f.joints)]
-    return rest + [f.reworded(severity="note") if f in of_drives else f for f in terms]
+    delayed = any(f.code == "torque_delay" for f in rest)
+    explained = [
+        f for f in terms
+        if (f.code in codes_with("term") and rescaled.issuperset(f.joints))
+        or (f.code == "joint_delay" and delayed)
+    ]  # fmt: skip
+    return rest + [f.reworded(severity="note") if f in explained else f for f in terms]
 
 
 def _explains(term: Finding, hypothesis: Finding) -> bool:
@@ -320,8 +326,10 @@ def _explains(term: Finding, hypothesis: Finding) -> bool:
     if term.evidence.get("share_pct", 0.0) < decisions.MAIN:
         return False
     if hypothesis.code == "unexplained_torque":
-        return bool(hypothesis.joints) and hypothesis.joints == term.joints
-    return hypothesis.code in _OF_MASSES and term.code in _OF_POSITION
+        return not term.joints or hypothesis.joints == term.joints
+    if hypothesis.code == "gravity":
+        return term.code in _OF_FORCE
+    return hypothesis.code in _OF_MASSES and term.code in (*_OF_POSITION, *_OF_FORCE)
 
 
 def _advice(term: Candidate, setting: str) -> str:

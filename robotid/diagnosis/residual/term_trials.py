@@ -124,6 +124,15 @@ class Sample:
         W = np.concatenate([self.W, columns * spread], axis=2)
         return replace(self, W=W, normal=Normal.of(W, self.r, self.segments, self.fitted))
 
+    def in_blocks(self, rows: int, length: int) -> tuple["Sample", Array]:
+        """Return the first samples in folds of interleaved blocks, and their order."""
+        fold = np.arange(rows) // length % decisions.SEGMENTS
+        order, edges = np.argsort(fold, kind="stable"), np.cumsum([0, *np.bincount(fold)]).tolist()
+        segments = tuple(slice(*pair) for pair in pairwise(edges))
+        W, r, weight = self.W[order], self.r[order], self.weight[order]
+        normal = Normal.of(W, r, segments, len(segments))
+        return replace(self, W=W, r=r, weight=weight, segments=segments, normal=normal), order
+
     def with_some_columns(self, which: Array) -> "Sample":
         """Return the same samples with fewer columns: which (c,)."""
         A, B = self.normal.A[:, which[:, None], which], self.normal.B[:, which]

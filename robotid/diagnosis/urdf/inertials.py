@@ -11,7 +11,7 @@ from robotid.base.findings import Finding, listed
 from robotid.base.tolerances import REMAINDER, SLACK
 from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import AGREES
+from robotid.diagnosis.decisions import AGREES, DIFFERS
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.robot.bodies import body_points, kinematic_lengths, link_places
 from robotid.robot.model import RobotModel
@@ -24,7 +24,6 @@ _OF_MASSES = (
     "current_for_torque", "joint_origin", "payload", "torque_scale", "total_mass", "urdf_mismatch",
 )  # fmt: skip
 _DENSEST, _LIGHTEST = 20_000.0, 10.0  # [kg/m^3] over the box: about solid tungsten, and foam
-_MARGIN = 0.1  # of the box's diagonal, by which a centre of mass may lie outside
 _LONGEST = np.sqrt(5.0)  # ellipsoid of a body with its mass on two sides, over the box
 _SLENDER = 1.6  # ellipsoid over the length that the kinematics give; a uniform rod has 1.29
 _THIN = 0.01  # [m] least side of a box, so that thin sheets have a volume
@@ -220,7 +219,7 @@ def _against_geometry(body: str, J: Array, points: Array) -> Iterator[Finding]:
     diagonal = float(np.linalg.norm(sides))
     centre = J[:3, 3] / mass
     outside = float(np.linalg.norm(np.maximum(np.maximum(low - centre, centre - high), 0.0)))
-    if outside > _MARGIN * diagonal:
+    if outside > DIFFERS * diagonal:
         yield finding(
             "com_outside", **of_link, what="box", centre=_metres(centre), low=_metres(low),
             high=_metres(high), outside=outside,

@@ -1,6 +1,7 @@
 """Zeros, scales, a clock and joints that are stated wrongly are named with their size."""
 
 import sys
+import xml.etree.ElementTree as ET
 from dataclasses import replace
 
 import numpy as np
@@ -9,10 +10,11 @@ import pytest
 from helpers.misfits import EFFECTS, log_with
 from helpers.paths import ROOT
 
+from robotid.base.findings import Finding
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.residual.discrepancies import alterations, explain_residual
-from robotid.diagnosis.residual.misfit import find_misfits
+from robotid.diagnosis.residual.discrepancies import alterations, explain_residual, readings
+from robotid.diagnosis.residual.misfit import find_misfits, settled
 from robotid.diagnosis.residual.term_trials import take_sample
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import inverse_dynamics
@@ -48,7 +50,7 @@ def fitted(model, logs, estimator=SETTINGS):
     return with_drives(recordings, estimator, wanted_families("viscous+coulomb", model.joints))
 
 
-def found(model, change, robot="ur5_robot.urdf", turn=None, duration=16.0):
+def found(model, change, robot="ur5_robot.urdf", turn=None, duration=16.0, estimator=None):
     """Return the findings on logs of a robot near its URDF that a change spoilt alike."""
     arm, logs = (
         build(replace(ROBOTS["ur5"], urdf=str(robot), joints=model.joints), (3,), turn=turn),
@@ -60,7 +62,7 @@ def found(model, change, robot="ur5_robot.urdf", turn=None, duration=16.0):
         run = measured(run, "usual", np.random.default_rng([4, part]))
         log = Log(run.t, run.q, run.tau, model.joints, run.v, path=f"run{part}.csv")
         logs.append(change(log))
-    fit = fitted(model, logs, EstimatorSettings("wls"))
+    fit = fitted(model, logs, estimator or EstimatorSettings("wls"))
     return explain_residual(fit, take_sample(fit))[1]
 
 
@@ -132,7 +134,8 @@ def test_columns_are_derivatives_of_the_torque(model):
         ("torque_scale", (model.joints[j],)): None,
     }
     found = {
-        (a.reading.code, a.joints): Z[..., 0] for a, Z in alterations(model, pi, sample).items()
+        (a.reading.code, a.joints): Z[..., 0]
+        for a, Z in alterations(model, readings(model, pi, sample)).items()
     }
     # gains: of one joint, or of all from one on but the first and the last
     ends = [model.joints[first:] for first in (1, 2, 3, 4)]
@@ -205,18 +208,96 @@ def test_a_base_that_is_not_level_makes_no_counterbalance(model):
 
 
 def test_a_joint_that_lies_elsewhere_is_named(model, tmp_path):
-    text = example_urdf("ur5_robot.urdf").read_text()
-    start = text.index('<joint name="elbow_joint"')
-    origin = text.index("<origin", start)
-    end = text.index("/>", origin)
-    path = tmp_path / "longer.urdf"
-    was = text[origin:end]
-    xyz = was.split('xyz="')[1].split('"')[0].split()
-    longer = was.replace(" ".join(xyz), " ".join([*xyz[:2], str(float(xyz[2]) + 0.05)]))
-    path.write_text(text[:origin] + longer + text[end:])
-    first = found(model, lambda log: log, robot=path)[0]
+    longer = rewritten(tmp_path / "longer.urdf", "elbow_joint", "xyz", [0.0, 0.0, 0.05])
+    first = found(model, lambda log: log, robot=longer)[0]
     assert (first.code, first.where) == ("joint_origin", "elbow_joint")
     assert first.evidence["size"] == pytest.approx(0.05, rel=0.25)
+
+
+def rewritten(path, joint, key, change):
+    """Write a UR5 with another ``xyz`` or ``rpy`` of the origin of a joint."""
+    tree = ET.parse(example_urdf("ur5_robot.urdf"))
+    (origin,) = tree.getroot().findall(f"joint[@name='{joint}']/origin")
+    values = np.array([float(x) for x in origin.get(key).split()]) + change
+    origin.set(key, " ".join(str(x) for x in values))
+    tree.write(path)
+    return path
+
+
+def test_a_joint_axis_of_another_direction_is_named(model, tmp_path):
+    tilted = rewritten(tmp_path / "tilted.urdf", "wrist_1_joint", "rpy", [np.radians(8), 0, 0])
+    first = found(model, lambda log: log, robot=tilted)[0]
+    assert (first.code, first.where) == ("axis_direction", "wrist_1_joint")
+    assert first.evidence["angle"] == pytest.approx(8.0, rel=0.2)
+    assert "its axis is tilted by" in first.message
+
+
+def test_the_delay_of_one_torque_is_named(model):
+    def change(log):
+        tau = log.tau.copy()
+        tau[:, 2] = np.interp(log.t - 0.02, log.t, tau[:, 2])
+        return replace(log, tau=tau)
+
+    (first,) = found(model, change)
+    assert (first.code, first.where) == ("joint_delay", "elbow_joint")
+    assert first.evidence["size"] == pytest.approx(0.02, rel=0.25)
+
+
+def test_a_base_that_is_off_the_level_by_two_degrees_is_named(model):
+    first = found(model, lambda log: log, turn=pin.exp3(np.radians([2.0, 0.0, 0.0])))[0]
+    assert (first.code, first.where) == ("gravity", "all joints")
+    assert first.evidence["angle"] == pytest.approx(2.0, abs=0.5)
+
+
+def disturbed(model, log, force, gravity=lambda t: 0.0 * t):
+    """Return a log with a force (3,) on the flange, and with gravity turned about the x axis."""
+    engine, tau = model.pin_model.copy(), log.tau.copy()
+    data, tip, down = (
+        engine.createData(),
+        engine.getFrameId("ee_link"),
+        np.array(engine.gravity.linear),
+    )
+    for k, (t, q) in enumerate(zip(log.t, log.q, strict=True)):
+        J = pin.computeFrameJacobian(engine, data, q, tip, pin.LOCAL_WORLD_ALIGNED)
+        engine.gravity.linear = down
+        tau[k] -= J[:3].T @ force(t) + pin.computeGeneralizedGravity(engine, data, q)
+        engine.gravity.linear = pin.exp3(np.array([gravity(t), 0.0, 0.0])) @ down
+        tau[k] += pin.computeGeneralizedGravity(engine, data, q)
+    return replace(log, tau=tau)
+
+
+def test_a_constant_force_on_the_flange_is_named_with_its_size(model):
+    force = np.array([12.0, -9.0, 0.0])
+    (first,) = found(model, lambda log: disturbed(model, log, lambda t: force))
+    assert (first.code, first.where, first.severity) == ("external_force", "all joints", "warning")
+    assert first.evidence["size"] == pytest.approx(15.0, rel=0.15)
+    assert "changes in time" not in first.message
+
+
+def pushed(t):
+    return 25.0 * np.sin([2.1 * t, 1.7 * t + 1.0, 1.3 * t + 2.0])
+
+
+@pytest.mark.parametrize(
+    ("force", "gravity", "code"),
+    [
+        (pushed, lambda t: 0.0, "external_force"),
+        (lambda t: np.zeros(3), lambda t: 0.4 * np.sin(0.3 * t), "moving_gravity"),
+    ],
+)
+def test_a_force_or_gravity_that_changes_in_time_is_the_only_finding(model, force, gravity, code):
+    (first,) = found(
+        model, lambda log: disturbed(model, log, force, gravity), estimator=SETTINGS
+    )  # unlike least squares with masses that act as gravity is tilted only
+    assert (first.code, first.where, first.severity) == (code, "all joints", "error")
+    assert first.evidence["share_pct"] > 50
+    if code == "moving_gravity":
+        assert first.evidence["angle"] == pytest.approx(np.degrees(0.4 / np.sqrt(2)), rel=0.3)
+    else:
+        assert first.evidence["size"] == pytest.approx(25.0 * np.sqrt(1.5), rel=0.3)
+    guesses = [Finding(x, "warning", "a.csv", "") for x in ("gravity", "unexplained_torque")]
+    (merged,) = settled(guesses, [first])
+    assert (merged.severity, merged.evidence["replaces"]) == ("error", 2.0)
 
 
 @pytest.mark.parametrize(("faster", "noise"), [(1.1, 0.1), (1.03, 0.03)])

@@ -270,6 +270,11 @@ def test_a_term_of_a_torque_in_another_unit_is_a_note():
     terms = [Finding("coupling", "warning", x, "It is.", joints=(x,)) for x in (PAN, LIFT)]
     assert [f.severity for f in settled([unit], terms)] == ["warning", "note", "warning"]
     assert settled([], terms) == terms
+    late = (
+        Finding("torque_delay", "warning", "run.csv", ""),
+        Finding("joint_delay", "warning", PAN, ""),
+    )
+    assert [f.severity for f in settled(late[:1], late[1:])] == ["warning", "note"]
 
 
 def test_a_log_too_short_to_judge_by_is_not_judged(three):
