@@ -88,7 +88,7 @@ def test_faults_of_the_new_log_lead_its_verdict(here):
     v[:, 1] *= 0.5
     found = verdict(folder, replace(other, v=v))
     assert found["status"] == "poor"
-    assert "dq_joint_2 is 0.5 times d(q)/dt" in found["reasons"][0]
+    assert "dq of joint_2 is 0.5 times d(q)/dt" in found["reasons"][0]
 
 
 def test_warnings_are_those_of_the_result_and_findings_those_of_the_new_log(here, monkeypatch):

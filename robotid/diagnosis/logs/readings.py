@@ -26,6 +26,7 @@ from robotid.robot.model import GRAVITY, RobotModel
 from robotid.robot.prior import prior_spread
 
 CERTAIN = 2.0  # decrease of the misfit from which another reading is certain
+_ALIKE = 1.0  # difference of misfits below which two readings explain a log equally well
 EXPLAINED = 0.1  # unexplained share of a torque below which a reading explains it
 _POOR = 0.0005  # unexplained share of a torque from which other readings are tried ...
 _GROSS = 0.05  # ... and from which other directions of the axes are tried
@@ -67,17 +68,18 @@ class _Motion:
     spread: Array  # (p,), prior deviations of the bodies
     gravity: Array  # (n,), factor of the torque of gravity on each joint
     inertia: Array  # (n,), factor of the torque of inertia on each joint
+    clock: float = 1.0  # speed of the time stamps
     subtracted: float = 0.0  # factor of the URDF's gravity that was subtracted from the torques
     segments: int = _SEGMENTS  # of the instants
 
     @cached_property
     def products(self) -> Array:
         """P^T P of each segment and joint: P = [bodies, drive, URDF's torque, columns of tau]."""
-        X, pi = self.inertial(self.v, self.a), self.model.standard_parameters()[self.moved]
+        X, pi = self.inertial(), self.model.standard_parameters()[self.moved]
         urdf = X @ pi
         is_changed = (self.gravity != 1.0).any() or (self.inertia != 1.0).any()
         if is_changed or self.subtracted:
-            weight = self.inertial(0.0 * self.v, 0.0 * self.a)
+            weight = replace(self, clock=0.0).inertial()
             gravity, inertia = (x[self.rows, None] for x in (self.gravity, self.inertia))
             X = inertia * (X - weight) + gravity * weight
             urdf = X @ pi - self.subtracted * (weight @ pi)
@@ -98,8 +100,9 @@ class _Motion:
         moves = self.model.support[self.rows, : len(self.spread)]
         return np.flatnonzero(moves.any(axis=0))
 
-    def inertial(self, v: Array, a: Array) -> Array:
+    def inertial(self) -> Array:
         """Return the columns of the limb's bodies, shape (N, m, p)."""
+        v, a = self.clock * self.v, self.clock**2 * self.a
         rows, bodies = np.nonzero(self.model.support[:, : len(self.spread) : 10])
         row = np.full(v.shape[1], -1)
         row[self.rows] = np.arange(len(self.rows))
@@ -300,8 +303,6 @@ def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
     one, g = np.eye(n), np.array(model.pin_model.gravity.linear)
     up = -g / (float(np.linalg.norm(g)) or 1.0)
     yield Reading("torque_sign", every, partial(_negated, on=np.ones(n)))
-    for speed in (0.1, 0.5, 2.0, 10.0):
-        yield Reading("time_scale", every, _timed, (float(np.log(speed)),), 0.3)
     axes = [sign * axis for axis in np.eye(3) for sign in (1, -1)]
     tilted = [_TILT * axis - up for axis in axes if abs(axis @ up) < 0.5 and g.any()]
     for start in (*axes, *tilted):
@@ -313,6 +314,8 @@ def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
         yield Reading("static_torque", every, lambda s: s.changed(inertia=np.zeros(n)))
         for j in rows:
             yield Reading("gravity_compensated", (j,), partial(_weightless, on=one[j]))
+    for speed in (0.1, 0.5, 2.0, 10.0):
+        yield Reading("time_scale", every, _timed, (float(np.log(speed)),), 0.3)
     for i, k in combinations(rows, 2):
         order = np.arange(n)
         order[[i, k]] = k, i
@@ -346,8 +349,7 @@ def _negated(samples: Samples, on: Array) -> Samples:
 
 
 def _timed(samples: Samples, log_speed: float) -> Samples:
-    speed = np.exp(log_speed)
-    return samples.changed(v=speed * samples.motion.v, a=speed**2 * samples.motion.a)
+    return samples.changed(clock=samples.motion.clock * np.exp(log_speed))
 
 
 def _falling(samples: Samples, *direction: float) -> Samples:
@@ -419,7 +421,7 @@ def _signed(samples: Samples, j: int) -> Samples:
 
     m, column = samples.motion, samples.order[j]
     own, size = replace(m, rows=np.array([j])), np.abs(m.tau[:, column])
-    bodies = own.inertial(m.v, m.a)[:, 0] @ m.model.standard_parameters()[own.moved]
+    bodies = own.inertial()[:, 0] @ m.model.standard_parameters()[own.moved]
     X = np.column_stack([bodies, drive_columns(m.model, m.q, m.v, m.a)[:, j]])
     X /= np.linalg.norm(X, axis=0) + _FLOOR
     tried = []
@@ -433,39 +435,55 @@ def _signed(samples: Samples, j: int) -> Samples:
     return samples.changed(tau=tau)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Best:
-    """A reading that explains the torques of a limb best, together with those before it."""
+    """A reading that explains the torques of a limb, together with those before it."""
 
     reading: Reading
     alike: tuple[Reading, ...]  # others that explain them about as well
+    samples: Samples  # so read
     gain: float  # decrease of the misfit by it
     before: Array  # (m,), unexplained shares without it
     after: Array  # (m,), and with it
 
 
-def best_readings(samples: Samples) -> Iterator[Best]:
-    """Yield the readings that explain the torques of a limb, one after the other."""
-    while True:
-        few = samples.few()
-        if few.share.max() < _POOR:
-            return
-        gains: dict[tuple[str, tuple[int, ...]], tuple[float, int, Reading]] = {}
-        for i, reading in enumerate(readings(few, bool(few.share.max() > _GROSS))):
-            gain = misfit(few.share) - misfit(reading.of(few).share)
-            if gain > gains.get((reading.code, reading.joints), (0.5 * CERTAIN,))[0]:
-                gains[reading.code, reading.joints] = gain, i, reading
-        tried = sorted(gains.values(), key=lambda x: -x[0])[:_TRIED]
-        refined = [(reading.refined(few, 8), i) for _, i, reading in tried]
-        left = {r: (misfit(r.of(samples).share), len(r.joints), i) for r, i in refined}
-        if not left:
-            return
-        least = min(left.values())[0]
-        alike = [r for r in sorted(left, key=lambda r: left[r][1:]) if left[r][0] < least + 1.0]
-        best = alike[0].refined(few, 20)
-        read = best.of(samples)
+def best_readings(samples: Samples) -> list[Best]:
+    """Return the readings that explain the torques of a limb together."""
+    # Each is the best one after those before it. If they do not explain the torques, other first
+    # ones are followed, too.
+    paths: list[tuple[float, list[Best]]] = []
+    for first in _accepted(samples):
+        path = [first]
+        while (more := next(_accepted(path[-1].samples), None)) is not None:
+            path.append(more)
+        share = path[-1].samples.share
+        paths.append((misfit(share) + CERTAIN * len(path), path))
+        if share.max() < _POOR:
+            break
+    least = min((left for left, _ in paths), default=0.0) + _ALIKE
+    return next((path for left, path in paths if left < least), [])
+
+
+def _accepted(samples: Samples) -> Iterator[Best]:
+    """Yield the readings that explain the torques of a limb certainly better, the best first."""
+    few = samples.few()
+    if few.share.max() < _POOR:
+        return
+    gains: dict[tuple[str, tuple[int, ...]], tuple[float, int, Reading]] = {}
+    for i, reading in enumerate(readings(few, bool(few.share.max() > _GROSS))):
+        gain = misfit(few.share) - misfit(reading.of(few).share)
+        if gain > gains.get((reading.code, reading.joints), (0.5 * CERTAIN,))[0]:
+            gains[reading.code, reading.joints] = gain, i, reading
+    tried = sorted(gains.values(), key=lambda x: -x[0])[:_TRIED]
+    refined = [(reading.refined(few, 8), i) for _, i, reading in tried]
+    left = {r: (misfit(r.of(samples).share), len(r.joints), i) for r, i in refined}
+    least = min(left.values(), default=(0.0,))[0] + _ALIKE
+    alike = [r for r in sorted(left, key=lambda r: left[r][1:]) if left[r][0] < least]
+    for one in [*alike, *sorted(set(left) - set(alike), key=lambda r: left[r])]:
+        reading = one.refined(few, 20)
+        read = reading.of(samples)
         gain = misfit(samples.held_out) - misfit(read.held_out)
-        if min(gain, misfit(samples.share) - misfit(read.share)) < CERTAIN:
-            return
-        yield Best(best, tuple(alike[1:]), gain, samples.unexplained, read.unexplained)
-        samples = read
+        if min(gain, misfit(samples.share) - misfit(read.share)) > CERTAIN:
+            others = tuple(r for r in alike if r != one)
+            shares = samples.unexplained, read.unexplained
+            yield Best(reading, others, read, gain, *shares)

@@ -64,7 +64,7 @@ class TorqueCheck:
         """Yield the other readings that explain the torques."""
         for samples, is_tried in self.limbs:
             if is_tried:
-                yield from _findings(samples, list(best_readings(samples)), name)
+                yield from _findings(samples, best_readings(samples), name)
 
     def loads(self, name: str) -> Iterator[Finding]:
         """Yield another scale, a load or another robot, and torques that nothing explains."""

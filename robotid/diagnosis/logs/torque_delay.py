@@ -31,6 +31,7 @@ _OVERSAMPLED = 8.0  # instants per period of the filter: the regressor has a lar
 # the noise at higher frequencies; the motion from which the regressor is computed has twice both.
 _TIMES = 1.5
 _OF_RATE = 0.15
+_SLOW = 0.05  # [rad/s] slower: a drive may be in stiction, and its friction is unknown around
 _SETTLED = 1.5  # [periods of the filter] settling time of the filter at an end of a segment
 _HARMONICS = 4  # of a torque that is periodic in the position, as of gears and magnets
 # Share of a torque that is noise even in an exact log, and of the largest singular value that
@@ -196,7 +197,7 @@ def _window(
     )
     at = motion.t[coarse[inner]]
     is_reversal = np.diff(np.sign(v), axis=0, append=np.sign(v[-1:])) != 0
-    slow = is_reversal | (np.abs(v) < AT_REST)
+    slow = is_reversal | (np.abs(v) < _SLOW)
     steady = [distance(at, t[slow[:, j]]) > _SETTLED / 2 * period for j in range(v.shape[1])]
     tau = low_pass(motion.tau[rows], 1 / step, signals)
     delayed = np.moveaxis(_interpolated(t, tau, at + _GRID[:, None]), 0, 2)  # (N, n, delays)

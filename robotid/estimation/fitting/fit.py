@@ -417,7 +417,7 @@ def _ground(
         for parts in (reductions if is_last else ())
     )
     factors, share = reduction.factors, recordings.share
-    if not any(R[:, -1].any() for R in factors.triangles):
+    if factors.rows.any() and not any(R[:, -1].any() for R in factors.triangles):
         raise DataError(
             "the torque of every joint is 0 in all fitted logs, which identifies nothing; check "
             "which columns have the torques, and whether the drives were on"

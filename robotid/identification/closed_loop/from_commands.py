@@ -374,7 +374,7 @@ def loop_findings(
     settled = [_settled_delay(one, result) for one in examined]
     gains: list[Finding] = []
     with suppress(NotConvergedError, DataError):  # a log that cannot be simulated, or a short one
-        gains.extend(_other_gains(result))
+        gains.extend(_other_gains(result) if result.has_gains else ())
     causes = [one for one in settled if one.code in codes_with("names_cause")]
     causes += [*gains, *_limits_found(result)]
     known = {joint for one in causes for joint in one.joints}
@@ -508,13 +508,11 @@ def _other_gains(result: PositionIdentification) -> Iterator[Finding]:
     """Yield logs with other gains than the fit, of joints whose simulated positions are wrong."""
     errors, fit = np.max([_relative_errors(run) for run in result.fitted], axis=0), result.fit
     loops, runs, others, least = fit.loops, result.validation, "the fit", errors / BETTER
-    if (
-        result.has_gains and len(result.fitted) > 1 and errors.max() > GOOD
-    ):  # the logs may contradict each other
+    if len(result.fitted) > 1 and errors.max() > GOOD:  # the logs may contradict each other
         first, *rest = result.fitted
         loops, others, least = fit_one_log(fit, first.log), first.log.name, 0.0 * errors
         runs = (*rest, *runs)
-    for run in runs if result.has_gains else ():
+    for run in runs:
         joints = np.flatnonzero(_relative_errors(run) > np.maximum(least, GOOD_POSITION))
         for j, figures in fit_gains(fit.simulator, loops, run.log, joints).items():
             # the motion with a missing friction term may have a gain that differs by some 30 %

@@ -176,7 +176,7 @@ def fit_one_log(fitted: Fitted, log: Log) -> Loops:
     windows = _few(cut_windows(log, _WINDOW, _LEAD))
     alone = replace(fitted.simulator, windows=windows, base=fitted.loops)
     alone = replace(alone, free_parameters=of_drives)
-    return alone.loops(OutputError().minimise(alone, fitted.estimate.theta[free]))
+    return alone.loops(OutputError(rounds=1).minimise(alone, fitted.estimate.theta[free]))
 
 
 def fit_gains(

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.corruptions import CASES, NOISE, ROBOTS, clean_log, controlled_log, robot, table_of
 from helpers.driven import arm
@@ -16,7 +17,7 @@ from robotid.cli.doctor import doctor
 from robotid.cli.job import Job, LogEntry, read_job
 from robotid.cli.logs import examine
 from robotid.data.files.read import write_columns, write_log
-from robotid.data.log import REPEATED, Trajectory, repeated_share
+from robotid.data.log import REPEATED, Log, Trajectory, repeated_share
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.diagnosis.logs.check_logs import check_excitation, diagnose, findings_to_dict
@@ -122,6 +123,65 @@ def test_where_names_the_joint_and_the_evidence_says_how_much(spoilt):
     (found,) = [f for f in findings if f.code == "torque_order"]
     assert found.where == "run.csv: shoulder_lift_joint, wrist_1_joint"
     assert "tau_wrist_1_joint is the torque of shoulder_lift_joint" in found.message
+
+
+def recorded(model, change=lambda robot: None, gravity=1.0, inertia=1.0, gain=(1.0,) * 6):
+    """Return a log of Pinocchio's own UR5 with bodies 10 % off, friction and 1 % of noise."""
+    rng, robot = np.random.default_rng(0), pin.Model(model.pin_model)
+    for body in robot.inertias.tolist()[1:]:
+        body.mass *= rng.uniform(0.9, 1.1)
+    change(robot)
+    t = np.arange(0.0, 12.0, 0.01)
+    w = 2 * np.pi * 0.15 * np.arange(1, 5)[:, None, None]
+    size, phase = rng.uniform(0.1, 0.3, (4, 1, 6)), rng.uniform(0, 2 * np.pi, (4, 1, 6))
+    angle = w * t[:, None] + phase
+    q, v, a = (size * x for x in (np.sin(angle), w * np.cos(angle), -(w**2) * np.sin(angle)))
+    q, v, a = (x.sum(axis=0) for x in (q, v, a))
+    q += [0.0, -1.0, 1.2, 0.5, 0.8, 0.0]
+    data, still = robot.createData(), np.zeros(6)
+    weight = np.array([pin.rnea(robot, data, x, still, still) for x in q])
+    whole = np.array([pin.rnea(robot, data, *x) for x in zip(q, v, a, strict=True)])
+    tau = inertia * (whole - weight) + gravity * weight
+    friction = 0.1 * np.tanh(v / 0.01) + 0.05 * v
+    tau += whole.std(axis=0) * (friction + 0.01 * rng.standard_normal(v.shape))
+    return Log(t=t, q=q, tau=np.asarray(gain) * tau, joints=model.joints, path="run.csv")
+
+
+def hung(robot):
+    robot.gravity.linear = 9.81 * np.array([0.0, np.sin(0.35), -np.cos(0.35)])
+
+
+SHIFT = np.pi / 2 * np.array([0.0, 1.0, 0.0, 0.0, 1.0, 0.0])
+QUARTER = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+READ = {
+    "as it is": (lambda m: (m, recorded(m)), {}),
+    "clock": (lambda m: (m, (x := recorded(m), replace(x, t=2 * x.t))[1]), {"time_scale": ()}),
+    "two zeros": (lambda m: (m, (x := recorded(m), replace(x, q=x.q + SHIFT))[1]), {
+        "position_offset": ("shoulder_lift_joint", "wrist_2_joint")}),
+    "axis": (lambda m: (m.with_turned_axis("elbow_joint", QUARTER, False), recorded(m)), {
+        "axis_direction": ("elbow_joint",)}),
+    "hung": (lambda m: (m, recorded(m, hung)), {"gravity": ()}),
+    "currents": (lambda m: (m, recorded(m, gain=[1, 1, 1, 50, 50, 50])), {
+        "current_for_torque": ("wrist_1_joint", "wrist_2_joint", "wrist_3_joint")}),
+    "static": (lambda m: (m, recorded(m, inertia=0.0)), {"static_torque": ()}),
+    "one compensated": (lambda m: (m, recorded(m, gravity=np.array([1, 1, 0, 1, 1, 1]))), {
+        "gravity_compensated": ("elbow_joint",)}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", READ)
+def test_one_reading_explains_the_torques_of_a_plant_by_pinocchio(ur5, name):
+    made, wanted = READ[name]
+    model, log = made(ur5)
+    found = [f for f in diagnose(model, [log], [], SIGNALS) if f.severity != "note"]
+    codes = {code: tuple(j for f in found if f.code == code for j in f.joints) for code in wanted}
+    assert codes == wanted
+    assert {f.code for f in found} <= set(wanted) | {"excitation"}
+    sizes = {"speed": 0.5, "offset": np.pi / 2, "factor": 0.02, "angle_deg": np.degrees(0.35)}
+    for key, size in sizes.items():
+        assert [f.evidence[key] for f in found if key in f.evidence] == pytest.approx(
+            [size for f in found if key in f.evidence], rel=0.1
+        )
 
 
 def test_delays_are_measured_and_corrected_only_on_request(spoilt):
