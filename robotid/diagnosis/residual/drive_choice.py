@@ -267,11 +267,10 @@ def _considered(
     every: _Options, this: Round[int], torque: float, chosen: Sequence[int], best: int | None
 ) -> list[Tried]:
     """Return the error that each family would give at its best shape, or as selected."""
-    names, by_family = [every.name(k) for k in chosen], _of_families(every, this.left, best)
+    names = [every.name(k) for k in chosen]
     return [
         Tried((*names, name), _percent(this.left[i], torque), this.p_value(i), i == best)
-        for name in dict.fromkeys(every.name(i) for i in this.left)
-        for i in [by_family[name]]
+        for name, i in _of_families(every, this.left, best).items()
     ]
 
 
@@ -279,8 +278,9 @@ def _of_families(
     every: _Options, left: Mapping[int, Array], selected: int | None = None
 ) -> dict[str, int]:
     """Return of each family the selected candidate, or that with the smallest residual."""
-    best_last = sorted(left, key=lambda i: (i == selected, -float(left[i].sum())))
-    return {every.name(i): i for i in best_last}
+    best_first = sorted(left, key=lambda i: (i != selected, float(left[i].sum())))
+    names = dict.fromkeys(map(every.name, left))
+    return {name: next(i for i in best_first if every.name(i) == name) for name in names}
 
 
 def _percent(left: Array, torque: float) -> float:
