@@ -26,7 +26,7 @@ from robotid.diagnosis.residual.term_trials import Sample, Trial, Trials, take_s
 from robotid.dynamics.torque import drive_motion_along
 from robotid.estimation.fitting.drive_terms import DriveChoice, FoundShape, Tried, with_shapes
 from robotid.estimation.fitting.fitted import Solution
-from robotid.robot.drive_term import DataRange, DriveMotion, DriveTerm, Family, MemorylessTerm
+from robotid.robot.drive_term import DataRange, DriveMotion, DriveTerm, Family
 from robotid.robot.drives import FAMILIES
 
 _GRID = 6  # values of a shape that are tested ...
@@ -45,7 +45,6 @@ class _Drive:
     motions: tuple[DriveMotion, ...]  # of each recording, all its samples
     taken: tuple[Array, ...]  # indices of the samples in each recording
     data_range: DataRange
-    largest: float  # largest absolute torque in the samples [N m or N]
     plain: Mapping[str, Array]  # columns of U of its plain parameters, by name
     known: dict[DriveTerm, Array] = field(default_factory=dict)  # columns of terms, (N,)
 
@@ -80,12 +79,7 @@ def _drives(
     """Return the drives whose families are stated or selected, by the index of their joint."""
     model = fit.model.with_reference(sample.standard)
     motions = [drive_motion_along(model, x.trajectory) for x in sample.recordings]
-    is_free, first = sample.basis is None, sample.weight.shape[1] - len(sample.joints)
-    largest = np.concatenate(
-        [motion.tau[:, first:] for motion in sample.at]
-        if is_free
-        else [x.log.tau for x in sample.recordings]  # with torques of constraint forces
-    )
+    first = sample.weight.shape[1] - len(sample.joints)
     used = sample.weight[:, first:] > 0
     drives = {}
     for j, joint in enumerate(sample.joints):
@@ -101,10 +95,8 @@ def _drives(
         taken = [(m.q[rows], m.v[rows]) for m, rows in zip(own, sample.taken, strict=True)]
         q, v = (np.concatenate(x)[used[:, j]] for x in zip(*taken, strict=True))
         ends = {key: (float(x.min()), float(x.max())) for key, x in (("q", q), ("v", np.abs(v)))}
-        drives[j] = _Drive(
-            bool(sample.is_prismatic[j]), is_free, own, sample.taken, ends,
-            float(np.abs(largest[:, j]).max()), plain,
-        )  # fmt: skip
+        is_prismatic, has_load = bool(sample.is_prismatic[j]), sample.basis is None
+        drives[j] = _Drive(is_prismatic, has_load, own, sample.taken, ends, plain)
     return drives
 
 
@@ -143,7 +135,7 @@ class _Options:
         trials, place = Trials.of(sample, columns)
         flat = [term for of_family in terms for term in of_family]
         positive = np.array([term.is_nonnegative for term in flat], dtype=bool)
-        highest = np.array([min(x.highest, drive.largest / _amplitude(drive, x)) for x in flat])
+        highest = np.array([x.highest for x in flat])
         return cls(own, place, positive, highest, trials)
 
     def name(self, i: int) -> str:
@@ -160,7 +152,7 @@ class _Options:
 
     def left_each(self, chosen: Sequence[int]) -> dict[int, Array]:
         """Return the squared residual of each segment with those chosen and another candidate."""
-        # Of candidates that oppose motion, below the largest torque, one family of each kind.
+        # Of candidates that oppose motion, one family of each kind.
         kinds = {_kind(self.name(k)) for k in chosen}
         other = [i for i in range(len(self.own)) if _kind(self.name(i)) not in kinds]
         columns = {i: self._columns([*chosen, i]) for i in other}
@@ -180,15 +172,6 @@ class _Options:
 def _kind(name: str) -> str:
     """Return the kind of a family: its name without a number."""
     return name.rstrip("0123456789")
-
-
-def _amplitude(drive: _Drive, term: DriveTerm) -> float:
-    """Return the largest value of a curve of velocity; next to 0 for another term."""
-    # At low speed the filter reduces the sign of the velocity and hides the amplitude of the curve.
-    if term.guards != "v" or not isinstance(term, MemorylessTerm):
-        return decisions.NOTHING
-    v = np.linspace(*drive.data_range["v"], 50)
-    return float(np.abs(term.amplitude(np.zeros_like(v), v)).max()) + decisions.NOTHING
 
 
 def _auto(sample: Sample, drive: _Drive) -> DriveChoice:
@@ -267,11 +250,10 @@ def _considered(
     every: _Options, this: Round[int], torque: float, chosen: Sequence[int], best: int | None
 ) -> list[Tried]:
     """Return the error that each family would give at its best shape, or as selected."""
-    names, by_family = [every.name(k) for k in chosen], _of_families(every, this.left, best)
+    names = [every.name(k) for k in chosen]
     return [
         Tried((*names, name), _percent(this.left[i], torque), this.p_value(i), i == best)
-        for name in dict.fromkeys(every.name(i) for i in this.left)
-        for i in [by_family[name]]
+        for name, i in _of_families(every, this.left, best).items()
     ]
 
 
@@ -279,8 +261,9 @@ def _of_families(
     every: _Options, left: Mapping[int, Array], selected: int | None = None
 ) -> dict[str, int]:
     """Return of each family the selected candidate, or that with the smallest residual."""
-    best_last = sorted(left, key=lambda i: (i == selected, -float(left[i].sum())))
-    return {every.name(i): i for i in best_last}
+    best_first = sorted(left, key=lambda i: (i != selected, float(left[i].sum())))
+    names = dict.fromkeys(map(every.name, left))
+    return {name: next(i for i in best_first if every.name(i) == name) for name in names}
 
 
 def _percent(left: Array, torque: float) -> float:

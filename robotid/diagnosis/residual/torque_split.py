@@ -29,7 +29,6 @@ from robotid.robot.model import RobotModel
 
 _RIGID = ("gravity", "inertia", "Coriolis")
 _QUARTERS = 4  # parts of a recording for the test of a drift, and pieces of each part
-_SLOW = 0.25  # of the RMS speed: below is low speed
 _BINS = 10  # of a quantity, with equal numbers of samples
 
 
@@ -194,8 +193,8 @@ class JointTorque:
         """The cause of the residual, and what to do."""
         rms, best = self.rms, self._best(self.follows)
         name, where = ("", 0.0) if best is None else (best.name, best.where)
-        is_speed = name == "speed"
-        slow = is_speed and abs(where) < _SLOW * self.size(self.quantities["speed"][1])
+        sizes = [0.0] if best is None else np.abs(best.centres)
+        is_slow = name == "speed" and abs(where) < float(np.median(sizes))
         quick = self.broadband or 0.0
         kinds = {
             "unused": bool(np.isnan(rms["measured"])),
@@ -211,7 +210,7 @@ class JointTorque:
         cause = sentence_of(
             "residual:cause", what=kind, left=_percent(rms["residual"] / (rms["measured"] or 1.0)),
             share=_percent(share), name=name, unit=self.unit if best is None else best.unit,
-            size=0.0 if best is None else best.means[0], low=slow, where=where,
+            size=0.0 if best is None else best.means[0], low=is_slow, where=where,
             names=", ".join(d.name for d in self.follows if d.name != "constant"),
         )  # fmt: skip
         before = () if self.fitted is None else self.fitted.follows

@@ -283,19 +283,14 @@ def _templates(model: RobotModel) -> Iterator[Finding]:
 
 def _copies(model: RobotModel, points: dict[str, Array]) -> Iterator[Finding]:
     """Yield links with the same inertial as a link of another size."""
-    groups: list[list[str]] = []
-    inertials = model.tree.inertials
-    values = {link: [x.mass, *x.com, *x.inertia] for link, x in inertials.items() if link in points}
-    for link in (body for body in model.layout.bodies if body in values):
-        for group in groups:
-            if np.allclose(values[link], values[group[0]], rtol=SLACK, atol=1e-12):
-                group.append(link)
-                break
-        else:
-            groups.append([link])
-    for group in groups:
+    groups: dict[tuple[float, ...], list[str]] = {}
+    for link in (body for body in model.layout.bodies if body in points):
+        if (inertial := model.tree.inertials.get(link)) is not None:
+            values = (inertial.mass, *inertial.com, *inertial.inertia)
+            groups.setdefault(values, []).append(link)
+    for (mass, *_), group in groups.items():
         boxes = np.sort([np.ptp(points[link], axis=0) for link in group], axis=1)
-        if len(group) < 2 or not boxes.any() or values[group[0]][0] <= 0:
+        if len(group) < 2 or not boxes.any() or mass <= 0:
             continue
         spread = float(np.max(np.abs(boxes - boxes[0])) / np.max(boxes))
         if spread >= AGREES:

@@ -329,6 +329,8 @@ FAULTS = {
     "reversed": (scaled(1.0, -1.0), {"imu_gravity": "its sign is reversed"}),
     "g": (scaled(1.0, 1 / 9.81), {"imu_gravity": "it is in units of g"}),
     "scale": (scaled(1.0, 1.3), {"imu_gravity": "its scale is wrong"}),
+    "subtracted": (lambda x: np.hstack([x[:, :3], x[:, 3:] - x[:, 3:].mean(axis=0)]),
+                   {"imu_gravity": "gravity was subtracted"}),
 }  # fmt: skip
 
 
