@@ -205,7 +205,7 @@ def scatter(segments: Sequence[Factors], theta: Array, sigma: Array, bread: Arra
 
 def _root(covariance: Array) -> Array:
     """Return L with L L^T = covariance, shape (c, c); variances may be 0."""
-    deviation = np.sqrt(np.diag(covariance))
+    deviation = np.sqrt(np.maximum(np.diag(covariance), 0.0))  # rounding of a variance of 0
     scale = np.where(deviation > 0.0, deviation, 1.0)
     variances, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(variances, 0.0)))
