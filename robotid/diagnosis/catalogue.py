@@ -29,6 +29,11 @@ def codes_with(key: str) -> tuple[str, ...]:
     return tuple(code for code, entry in entries().items() if key in entry)
 
 
+def is_cause(code: str) -> bool:
+    """Return whether a finding names a cause of a residual."""
+    return code == "gain_change" or entries()[code]["page"] in ("residual", "torques")
+
+
 def step_of(code: str) -> str:
     """Return the next step that removes the cause of a finding; empty if there is none."""
     return str(entries().get(code, {}).get("step", ""))

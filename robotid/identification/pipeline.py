@@ -144,7 +144,7 @@ def conclude(
     # notes, and what the doctor says of excitation and logs, are replaced by those of the fit
     replaced = ("excitation", "log_assumption")
     others = [f for f in doctor_findings if f.severity != "note" and f.code not in replaced]
-    merged = settled(others, of_fit)
+    merged = settled(others, of_fit, ignore)
     merged = [finding for finding in merged if not explained_by_assumed(model, finding)]
     merged = rejected(merged, result.predictions, result.scale_check)
     log_errors = blocking(merged, ignore, is_robust=is_robust)

@@ -269,6 +269,10 @@ def test_a_term_of_a_torque_in_another_unit_is_a_note():
     unit = Finding("current_for_torque", "warning", f"run.csv: {PAN}", "", joints=(PAN,))
     terms = [Finding("coupling", "warning", x, "It is.", joints=(x,)) for x in (PAN, LIFT)]
     assert [f.severity for f in settled([unit], terms)] == ["warning", "note", "warning"]
+    # a torque of the wrong sign leaves a residual that looks like any of them
+    sign = Finding("torque_sign", "error", "run.csv: boom", "", joints=("boom",))
+    for ignore, severity in (((), "note"), (("torque_sign",), "warning")):
+        assert {f.severity for f in settled([sign], terms, ignore)[1:]} == {severity}
     assert settled([], terms) == terms
     late = (
         Finding("torque_delay", "warning", "run.csv", ""),
