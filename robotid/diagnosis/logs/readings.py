@@ -32,7 +32,7 @@ _POOR = 0.0005  # unexplained share of a torque from which other readings are tr
 _GROSS = 0.05  # ... and from which other directions of the axes are tried
 _FLOOR = 1e-5  # an unexplained share below this is rounding
 _LOOSE = 10.0  # prior deviation of the bodies, in sizes of the URDF's
-_FEW = 48  # instants with which the readings are chosen that are tried with all
+_FEW = 24  # instants with which the readings are chosen that are tried with all
 _SEGMENTS = 8  # of the log that are held out in turn
 _BODIES = 20  # of a limb, at most
 _TRIED = 5  # readings that are tried with all instants
@@ -132,10 +132,11 @@ class Samples:
         return cls(motion, np.arange(len(one)), one, one)
 
     def few(self) -> "Samples":
-        """Return some of the instants, in one segment."""
+        """Return some of the instants, in one segment, with bodies nearer the URDF's."""
         step = max(1, len(self.motion.q) // _FEW)
         some = {key: getattr(self.motion, key)[::step] for key in ("q", "v", "a", "tau")}
-        return self.changed(segments=1, size=_variation(some["tau"]), **some)
+        spread = self.motion.spread / _LOOSE
+        return self.changed(segments=1, size=_variation(some["tau"]), spread=spread, **some)
 
     def changed(self, **values: Any) -> "Samples":  # noqa: ANN401
         """Return the samples with other values of the motion or of the robot."""

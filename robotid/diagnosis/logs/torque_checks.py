@@ -87,8 +87,7 @@ class TorqueCheck:
 def is_suspect(check: TorqueCheck, others: Sequence[TorqueCheck]) -> bool:
     """Return whether a log explains a torque clearly worse than another log of the robot."""
     least = np.min([one.share for one in others], axis=0)
-    floor = TINY + least
-    return bool((check.share > np.exp(CERTAIN) * floor).any())
+    return bool((check.share > np.maximum(EXPLAINED, np.exp(CERTAIN) * least)).any())
 
 
 def _findings(samples: Samples, found: Sequence[Best], log: str) -> Iterator[Finding]:
@@ -96,7 +95,7 @@ def _findings(samples: Samples, found: Sequence[Best], log: str) -> Iterator[Fin
     rows, joints = samples.motion.rows.tolist(), samples.motion.model.joints
     final = found[-1].after if found else np.zeros(len(rows))
     exchanged: dict[str, list[Best]] = {}
-    for one in found:
+    for one in _with_one_gain(found):
         reading = one.reading
         concerned = np.isin(rows, reading.joints) | (not reading.joints)
         is_unit = reading.code == "current_for_torque" and not reading.joints
@@ -126,6 +125,18 @@ def _findings(samples: Samples, found: Sequence[Best], log: str) -> Iterator[Fin
             gain=sum(one.gain for one in pairs), unexplained=pairs[0].before.max(),
             unexplained_so_read=pairs[-1].after.max(),
         )  # fmt: skip
+
+
+def _with_one_gain(found: Sequence[Best]) -> Sequence[Best]:
+    """Return readings with gains of joints that are about equal as one."""
+    gains = [one for one in found if one.reading.code == "current_for_torque"]
+    logs = [one.reading.values[0] for one in gains if one.reading.joints]
+    if len(logs) < max(2, len(gains)) or np.ptp(logs) > np.log(_ALIKE):
+        return found
+    joints = tuple(sorted(j for one in gains for j in one.reading.joints))
+    reading = replace(gains[-1].reading, joints=joints, values=(float(np.mean(logs)),))
+    joint = replace(gains[-1], reading=reading, before=gains[0].before)
+    return [*(one for one in found if one not in gains), joint]
 
 
 _ORDERS = ("torque_order", "position_order", "joint_order")

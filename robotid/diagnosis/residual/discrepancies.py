@@ -289,10 +289,16 @@ def _changing(
     knots = np.pad(np.linspace(0.0, rows, count - 1), 2, "edge")
     B = BSpline.design_matrix(order, knots, 2).toarray()  # (rows, count), quadratic
     changing = alterations(model, in_time)
-    splines = {
-        (one, True): (Z[order, ..., None] * B[:, None, None]).reshape(rows, n, -1)
-        for one, Z in changing.items()
-    }
+    # a force explains part of what gravity does: the others are compared if it explains some
+    changing = dict(sorted(changing.items(), key=lambda x: x[0].reading.code))
+    splines: dict[tuple[_Alteration, bool], Array] = {}
+    for one, Z in changing.items():
+        splines[one, True] = (Z[order, ..., None] * B[:, None, None]).reshape(rows, n, -1)
+        if len(splines) == 1:
+            trial = Trials(folded, splines[one, True]).held_out
+            left = [trial.left(list(range(k))).sum() for k in (0, 3 * count)]
+            if left[1] > (1 - decisions.DIFFERS) * left[0]:
+                return
     plain = {(one, False): Z[order] for one, Z in {**changing, **constant}.items()}
     trials, offered = Trials.of(folded, splines | plain)
     best = next(trials.accepted(offered, decisions.ALTERATION, lambda x: len(offered[x])), None)
