@@ -448,28 +448,18 @@ class Best:
     after: Array  # (m,), and with it
 
 
-def best_readings(samples: Samples) -> list[Best]:
-    """Return the readings that explain the torques of a limb together."""
-    # Each is the best one after those before it. If they do not explain the torques, other first
-    # ones are followed, too.
-    paths: list[tuple[float, list[Best]]] = []
-    for first in _accepted(samples):
-        path = [first]
-        while (more := next(_accepted(path[-1].samples), None)) is not None:
-            path.append(more)
-        share = path[-1].samples.share
-        paths.append((misfit(share) + CERTAIN * len(path), path))
-        if share.max() < _POOR:
-            break
-    least = min((left for left, _ in paths), default=0.0) + _ALIKE
-    return next((path for left, path in paths if left < least), [])
+def best_readings(samples: Samples) -> Iterator[Best]:
+    """Yield the readings that explain the torques of a limb, each the best after those before."""
+    while (best := _best(samples)) is not None:
+        yield best
+        samples = best.samples
 
 
-def _accepted(samples: Samples) -> Iterator[Best]:
-    """Yield the readings that explain the torques of a limb certainly better, the best first."""
+def _best(samples: Samples) -> Best | None:
+    """Return the reading that explains the torques of a limb best, None if none does certainly."""
     few = samples.few()
     if few.share.max() < _POOR:
-        return
+        return None
     gains: dict[tuple[str, tuple[int, ...]], tuple[float, int, Reading]] = {}
     for i, reading in enumerate(readings(few, bool(few.share.max() > _GROSS))):
         gain = misfit(few.share) - misfit(reading.of(few).share)
@@ -480,11 +470,11 @@ def _accepted(samples: Samples) -> Iterator[Best]:
     left = {r: (misfit(r.of(samples).share), len(r.joints), i) for r, i in refined}
     least = min(left.values(), default=(0.0,))[0] + _ALIKE
     alike = [r for r in sorted(left, key=lambda r: left[r][1:]) if left[r][0] < least]
-    for one in [*alike, *sorted(set(left) - set(alike), key=lambda r: left[r])]:
-        reading = one.refined(few, 20)
-        read = reading.of(samples)
-        gain = misfit(samples.held_out) - misfit(read.held_out)
-        if min(gain, misfit(samples.share) - misfit(read.share)) > CERTAIN:
-            others = tuple(r for r in alike if r != one)
-            shares = samples.unexplained, read.unexplained
-            yield Best(reading, others, read, gain, *shares)
+    if not alike:
+        return None
+    best = alike[0].refined(few, 20)
+    read = best.of(samples)
+    gain = misfit(samples.held_out) - misfit(read.held_out)
+    if min(gain, misfit(samples.share) - misfit(read.share)) < CERTAIN:
+        return None
+    return Best(best, tuple(alike[1:]), read, gain, samples.unexplained, read.unexplained)

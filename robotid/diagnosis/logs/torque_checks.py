@@ -64,13 +64,13 @@ class TorqueCheck:
         """Yield the other readings that explain the torques."""
         for samples, is_tried in self.limbs:
             if is_tried:
-                yield from _findings(samples, best_readings(samples), name)
+                yield from _findings(samples, list(best_readings(samples)), name)
 
     def loads(self, name: str) -> Iterator[Finding]:
         """Yield another scale, a load or another robot, and torques that nothing explains."""
         yield from _check_loads(self.probe, self.share, name)
-        rows = np.concatenate([samples.motion.rows for samples, _ in self.limbs])
-        bad = [j for j in rows if self.share[j] > _UNEXPLAINED]
+        moving = [j for samples, _ in self.limbs for j in samples.motion.rows]
+        bad = [j for j in moving if self.share[j] > _UNEXPLAINED]
         if 2 * len(bad) > len(self.share):
             yield finding(
                 "unexplained_torque", name, what="robot", joints=len(bad), of=len(self.share),
