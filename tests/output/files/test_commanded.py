@@ -242,7 +242,7 @@ def test_isaac_actuators_are_grouped_and_read_back(result, tmp_path, capsys):
 
 def test_the_pages_name_each_format():
     readme, page = (
-        path.read_text() for path in (ROOT / "README.md", DOCS / "reference" / "export_formats.md")
+        path.read_text() for path in (ROOT / "README.md", DOCS / "how_to" / "exports.md")
     )
     for kind in formats():
         assert re.search(rf"`{kind}`|--format {kind} ", readme)
