@@ -263,7 +263,7 @@ def test_what_is_typed_for_several_joints_is_typed_for_each():
     ]  # fmt: skip
     (cause,) = grouped(found, ["j6", "j7"])
     assert cause.messages == (
-        "a, b: j6, j7 is locked at 0 rad but is at 0.1824 to 1 rad in the log; state locked = "
+        "a, b: j6, j7 is locked at 0 rad but is at 0.1824 to 1 rad in the log; set locked = "
         "{ j6 = 0.1824 }, locked = { j7 = 1.0 } (--lock j6=0.1824 --lock j7=1.0)",
     )
 

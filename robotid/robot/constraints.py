@@ -50,7 +50,7 @@ class Contact(Settings):
     uncertainty: float | None = setting(
         None,
         "standard deviation of the point of contact along each axis [m], an error of the "
-        "intervals; estimated from the logs if not stated",
+        "intervals; default: estimated from the logs",
         within=_LENGTH,
     )
     axes: str = setting(
@@ -218,7 +218,7 @@ def check_constraints(
                 )
     stated = [constraint.frames for constraint in constraints]
     if twice := [x for k, x in enumerate(stated) if x in stated[:k]]:
-        raise ModelError(f"the contact or loop at {listed(twice[0])} is stated twice; remove one")
+        raise ModelError(f"the contact or loop at {listed(twice[0])} is given twice; remove one")
     for name, terms in own_terms.items() if constraints else ():
         if loaded := [term.name for term in terms if term.needs_load]:
             raise SettingsError(

@@ -29,23 +29,23 @@ class LoopSettings(Settings):
         among=("pd", "torque"),
     )  # fmt: skip
     kp: PerJoint | None = setting(
-        None, "position gain [N m/rad or N/m], for all joints or by joint; fitted if not stated, "
+        None, "position gain [N m/rad or N/m], for all joints or by joint; default: fitted, "
         "relative to gravity and inertia of the bodies", **GAIN,
     )  # fmt: skip
     kd: PerJoint | None = setting(
-        None, "speed gain [N m s/rad or N s/m], for all joints or by joint; if not stated, it is "
+        None, "speed gain [N m s/rad or N s/m], for all joints or by joint; default: "
         "part of the viscous friction, unless the logs have speed commands or torques", **LEVEL,
     )  # fmt: skip
     limit: PerJoint | str | None = setting(
         None,
-        "torque limit of the drive [N m or N], for all joints or by joint; if not stated, it is "
+        "torque limit of the drive [N m or N], for all joints or by joint; default: "
         "fitted where the drive saturates; 'find': fitted for every joint",
         reads=(int, float, dict, str),
         within=GAIN["within"],
         among=("find",),
     )
     delay: PerJoint | None = setting(
-        None, "delay of the command [s], for all joints or by joint; fitted if not stated", **DELAY
+        None, "delay of the command [s], for all joints or by joint; default: fitted", **DELAY
     )
     delays: str = setting(
         "one", "the fitted delays: 'one' for the robot (bus and controller), or one per 'group'",
@@ -53,18 +53,18 @@ class LoopSettings(Settings):
     )  # fmt: skip
     rate: float | None = setting(
         None, "sampling rate of a discrete-time controller, which holds its torque until the next "
-        "sample [Hz]; if not stated, the controller is in continuous time", within=_CLOCK,
+        "sample [Hz]; default: the controller is in continuous time", within=_CLOCK,
     )  # fmt: skip
     gravity_compensation: bool = setting(
         False, "whether the controller adds the gravity torque of the URDF"
     )
     groups: Mapping[str, Sequence[str]] = setting(
         {}, "joints with equal drives, by name of the group; they share gains, armature and "
-        "viscous friction. If not stated, joints that are equal in the URDF form a group",
+        "viscous friction; default: joints that are equal in the URDF form a group",
         reads=Entries(dict, (list,)),
     )  # fmt: skip
     zeros: str = setting(
-        "urdf", "zero and sign of the encoders: 'urdf', those of the URDF; 'find', fitted from "
+        "urdf", "zero and sign of the encoders: 'urdf': as in the URDF; 'find': fitted from "
         "gravity",
         among=("urdf", "find"),
     )  # fmt: skip

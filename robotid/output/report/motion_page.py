@@ -140,7 +140,7 @@ def _over_time(model: RobotModel, content: Mapping[str, Any], course: Course) ->
             lines = tuple(_lines(model, course.values[k], free))
             name = f"{kind} [{' or '.join(units)}]"
             chart = Chart(f"{kind} of each joint", course.t, lines, "time [s]", name, "time")
-            charts.append(chart_html(chart, f"{kind.capitalize()} without a stated limit"))
+            charts.append(chart_html(chart, f"{kind.capitalize()} without a limit"))
     return f'<div class="plots">\n{"".join(charts)}</div>\n'
 
 
