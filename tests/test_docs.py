@@ -245,15 +245,16 @@ def codes_of_findings():
     return {code for code in codes if ":" not in code}  # with it: a sentence of a finding
 
 
-def test_each_finding_has_its_section():
+def test_each_finding_has_its_line():
     shown = [
         code
         for page in (DOCS / "reference/findings").glob("*.md")
-        for code in re.findall(r"^##+ ([a-z_]+)$", page.read_text(), re.MULTILINE)
+        for code in re.findall(
+            r"^\| `([a-z_]+)`\{#\1\} (?:note|warning|error) \| \S", page.read_text(), re.M
+        )
     ]
-    assert len(shown) == len(set(shown)), "a code has two sections"
-    codes = codes_of_findings()
-    assert codes == set(shown)
+    assert len(shown) == len(set(shown)), "a code has two lines"
+    assert codes_of_findings() == set(shown)
     index = (DOCS / "reference/findings/index.md").read_text()
     assert sorted(re.findall(r"\[`(\w+)`\]\(\w+\.md#\1\)", index)) == sorted(shown)
 
