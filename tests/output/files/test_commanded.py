@@ -158,7 +158,7 @@ def test_impossible_drives_are_refused(result, tmp_path):
         changed = with_entries(
             lambda e, n=name, x=wrong: e | ({"value": x} if e["name"] == n else {})
         )
-        with pytest.raises(DataError, match=f"{name} is {wrong:g}, wanted {wanted}"):
+        with pytest.raises(DataError, match=f"{name} is {wrong:g}, expected {wanted}"):
             _ = changed.commanded
     none = with_entries(lambda e: None if e["name"].endswith((".kp", ".kd")) else e)
     assert none.commanded == ()
