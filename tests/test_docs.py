@@ -109,12 +109,12 @@ def test_the_page_of_the_job_file_is_what_the_settings_say(tmp_path):
 
 
 def test_the_job_of_commands_and_positions_is_accepted(tmp_path):
-    tables = examples_of("explanation/closed_loop.md")[:2]
+    tables = examples_of("reference/closed_loop.md")[:2]
     job, driven = (job_from_settings(table, "job.toml", tmp_path) for table in tables)
     assert job.estimator.name == "simulation"
     assert (job.controller.kp, job.controller.kd) == (20.0, 1.5)
     assert driven.controller.kind == "torque"
-    page = (DOCS / "explanation/closed_loop.md").read_text()
+    page = (DOCS / "reference/closed_loop.md").read_text()
     unstated = page.partition("These keys of `[controller]`")[2].partition("- **Groups")[0]
     keys = re.findall(r"`(\w+)(?: = \"find\")?`", unstated)
     assert len(keys) > 4
@@ -240,15 +240,16 @@ def codes_of_findings():
     return {code for code in codes if ":" not in code}  # with it: a sentence of a finding
 
 
-def test_each_finding_has_its_section():
+def test_each_finding_has_its_line():
     shown = [
         code
         for page in (DOCS / "reference/findings").glob("*.md")
-        for code in re.findall(r"^##+ ([a-z_]+)$", page.read_text(), re.MULTILINE)
+        for code in re.findall(
+            r"^\| `([a-z_]+)`\{#\1\} (?:note|warning|error) \| \S", page.read_text(), re.M
+        )
     ]
-    assert len(shown) == len(set(shown)), "a code has two sections"
-    codes = codes_of_findings()
-    assert codes == set(shown)
+    assert len(shown) == len(set(shown)), "a code has two lines"
+    assert codes_of_findings() == set(shown)
     index = (DOCS / "reference/findings/index.md").read_text()
     assert sorted(re.findall(r"\[`(\w+)`\]\(\w+\.md#\1\)", index)) == sorted(shown)
 
@@ -450,10 +451,9 @@ def test_a_dataset_of_lerobot(tmp_path, monkeypatch, capsys):
 def test_a_result_in_mujoco(tmp_path, monkeypatch, identified, capsys):
     monkeypatch.chdir(tmp_path)
     robotid.save_result(identified, "result")
-    export = commands("how_to/mujoco.md")[0]
-    assert main(export) == 0
+    assert main(commands("how_to/exports.md")[0]) == 0
     capsys.readouterr()
-    run("how_to/mujoco.md", 0)
+    run("how_to/exports.md", 0)
     difference = np.array(re.findall(r"-?\d+\.\d*", capsys.readouterr().out), dtype=float)
     offsets = [x for n, x in zip(identified.model.layout.names, identified.standard, strict=True)
                if n.endswith(".offset")]  # fmt: skip
@@ -466,9 +466,9 @@ def test_servos_in_mujoco(tmp_path, monkeypatch, capsys):
     written_result(leg, tmp_path / "result")
     log, _ = recorded(leg, np.random.default_rng(1), duration=2.0)
     write_log(log, tmp_path / "second.csv")
-    assert main(commands("how_to/mujoco.md")[1]) == 0
+    assert main(commands("how_to/exports.md")[1]) == 0
     capsys.readouterr()
-    run("how_to/mujoco.md", 1)
+    run("how_to/exports.md", 1)
     errors = ast.literal_eval(capsys.readouterr().out)
     assert set(errors) == set(leg.model.joints)
     assert max(errors.values()) < 0.01  # [rad]
@@ -477,13 +477,14 @@ def test_servos_in_mujoco(tmp_path, monkeypatch, capsys):
 def test_draws_are_within_the_ranges(tmp_path, monkeypatch, identified, capsys):
     monkeypatch.chdir(tmp_path)
     robotid.save_result(identified, "result")
-    assert main(commands("how_to/domain_randomisation.md")[0]) == 0
-    names = run("how_to/domain_randomisation.md", 0)
+    ranges, *samples = commands("how_to/exports.md")[3:6]
+    assert main(ranges) == 0
+    names = run("how_to/exports.md", 4)
     assert set(names["draw"]) == set(names["bodies"])
     assert all(mass > 0 for mass in names["draw"].values())
-    for command in commands("how_to/domain_randomisation.md")[1:3]:
+    for command in samples:
         assert main(command) == 0
-    names = run("how_to/domain_randomisation.md", 1)
+    names = run("how_to/exports.md", 5)
     samples, model, layout = names["samples"], names["model"], identified.model.layout
     names["set_sample"](model, 17)
     capsys.readouterr()
