@@ -42,11 +42,10 @@ from robotid.robot.examples import example_urdf
 from robotid.robot.prior import REASONS
 
 sys.path.append(str(ROOT / "benchmarks"))
-from write_tables import BLOCK, PAGES, digest
+from write_tables import FOLDER, MACHINE, digest, read
 
 #: Drive parameters as the table of names has them, the first of those with a number.
 PARAMETERS = {cls().name for cls in TERM_CLASSES.values()} | set(TERMS)
-MACHINE = r"Python \d+\.\d+.*(x86_64|aarch64|arm64)"
 GUIDES = sorted([*DOCS.glob("tutorials/*.md"), *DOCS.glob("how_to/*.md")])
 
 
@@ -285,12 +284,8 @@ def test_online_tracker(capsys):
 
 
 def test_doctor_lists_every_corruption_and_none_other():
-    page = (DOCS / "evidence/doctor.md").read_text()
-    rows = re.findall(r"^\| (.+?) \| (.+?) \| (\d)/8 \| .+ \|$", page, re.MULTILINE)
-    assert {name: codes for name, codes, _ in rows} == {
-        name: ", ".join(case.codes) for name, case in CASES.items()
-    }
-    assert f"{sum(int(found) for *_, found in rows)} of {8 * len(CASES)}" in page
+    rows = {name: codes for name, codes, *_ in read("doctor")[1:]}
+    assert rows == {name: ", ".join(case.codes) for name, case in CASES.items()}
 
 
 def codes_of_findings():
@@ -345,20 +340,25 @@ def pages():
     return sorted(page for page in DOCS.rglob("*.md") if page.parent.name != "skill")
 
 
-@pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)
-def test_tables_of_benchmarks_are_as_these_wrote_them(page):
-    text = page.read_text()
-    blocks = list(BLOCK.finditer(text))
-    assert text.count("<!-- table of ") == len(blocks), "a mark is broken"
-    for found in blocks:
-        name, shown = found["name"], found["body"]
-        again = f"write it anew: python benchmarks/write_tables.py {name}"
-        assert PAGES[name] == page.relative_to(DOCS).as_posix()
-        if found["digest"] == "-":  # carried over from before there were marks
-            continue
-        assert digest(shown) == found["digest"], f"bench_{name} wrote other figures; {again}"
-        assert re.search(r"robotid \d.*\n", shown), f"no version under bench_{name}; {again}"
-        assert re.search(MACHINE, shown), f"no machine under bench_{name}; {again}"
+@pytest.mark.parametrize("row", read("tables")[1:], ids=lambda row: row[0])
+def test_tables_of_benchmarks_are_as_these_wrote_them(row):
+    name, command, version, machine, _, written = row
+    again = f"write it anew: python benchmarks/write_tables.py {name}"
+    assert (ROOT / re.search(r"\w+/\S+\.py", command)[0]).is_file()
+    assert re.fullmatch(r"\d+\.\d+\.\d+", version), f"no version of {name}; {again}"
+    assert MACHINE.fullmatch(machine), f"no machine of {name}; {again}"
+    assert written == digest(name), f"{name}.csv has other figures; {again}"
+
+
+def test_the_page_of_evidence_has_the_figures_of_every_table():
+    listed = {name: notes for name, _, _, _, notes, _ in read("tables")[1:]}
+    assert listed.keys() | {"tables"} == {path.stem for path in FOLDER.glob("*.csv")}
+    page, number = (FOLDER / "index.md").read_text(), r"\d+(?:[.,]\d+)*"
+    assert listed.keys() <= set(re.findall(r"\[(\w+)\]\(\1\.csv\)", page))
+    for figures, links in re.findall(r"^\|.* \| (.*?) \| (\[.*\.csv\).*) \|$", page, re.MULTILINE):
+        tables = [listed[name] + str(read(name)) for name in re.findall(r"\[(\w+)\]", links)]
+        known = re.findall(number, " ".join(tables))
+        assert set(re.findall(number, figures)) <= set(known), f"{figures} is not in {links}"
 
 
 @pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)
