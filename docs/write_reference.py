@@ -1,11 +1,13 @@
 """Write the pages of the reference that follow from the code.
 
-``python docs/write_reference.py`` writes the keys of job files and of plants.
+``python docs/write_reference.py`` writes the keys of job files and of plants, and the findings.
 """
 
 import math
+import re
 from dataclasses import MISSING
 from pathlib import Path
+from string import Formatter
 
 from robotid.cli.job import Job, LogEntry, PayloadEntry
 from robotid.data.signal_settings import (
@@ -15,6 +17,7 @@ from robotid.data.signal_settings import (
     SignalSettings,
     Transmission,
 )
+from robotid.diagnosis.catalogue import entries
 from robotid.dynamics.simulation.simulation_settings import Simulation
 from robotid.estimation.fitting.estimator_settings import ESTIMATORS, ConstraintSettings
 from robotid.identification.closed_loop.loop_settings import LoopSettings
@@ -113,6 +116,68 @@ ESTIMATION = """# Job file: estimators
 The tables of a [job file](job_file.md) that choose the estimator, its constraints, and the controller of closed-loop identification.
 This page is written by `python docs/write_reference.py` from the settings in the code.
 """
+#: Parts that are added to a sentence about the residual where there is more to report.
+OPTIONAL = {
+    "also",
+    "asked",
+    "bits_of",
+    "change",
+    "conclusion",
+    "confirmed",
+    "explained",
+    "locked",
+    "percent",
+    "widened",
+}
+#: The pages of findings, by the key in the catalogue: title, and what the reader must know first.
+FINDINGS = {
+    "refused": ("Refused logs", """These errors cannot be ignored, and no result is written. `robotid doctor` lists them; `identify` ends with exit code 1. The
+message in the terminal also names the place and the values found."""),
+    "logs": ("Logs: time stamps, motion, sensors", "These findings need no model of the robot."),
+    "bases": ("Logs: floating bases, contacts, loops", """See [legged robots](../../how_to/legged.md) and [closed chains](../../how_to/closed_chains.md)."""),
+    "torques": ("Logs: torques and the URDF", """Before the identification, each log is fitted with masses of 0 or more, friction and motor inertia. "Unexplained" is the share
+of the variance of a torque that this fit leaves. Of several explanations, the best one is reported. A validation error below 5 % turns findings on masses, gravity and
+unexplained torque into notes. [Drive gains](../../how_to/drive_gains.md) shows how to find unknown gains."""),
+    "commands": ("Logs: commands and positions", """These findings describe the loop between the commanded and the measured position of each joint
+([servo arm](../../tutorials/servo_arm.md))."""),
+    "urdf": ("URDF", """`robotid inspect robot.urdf` reports these findings. `com_outside`, `density`, `gyration` and `ellipsoid` are reported for identified bodies,
+too."""),
+    "result": ("Result", "These findings describe the identified parameters."),
+    "residual": ("Residual of the fit", """Each candidate is fitted beside all base parameters, and counts by the share of the squared residual that it explains on held-out segments.
+A missing drive term (`friction_shape` to `drift`) is a warning if it explains 25 % or more, is 2 % of the torque or more, and validation logs confirm it. The
+message of a missing term names the setting that adds it: `friction`, `[drives]` or `[[coupling]]` ([friction](../../explanation/friction.md)). `position_offset` and `gravity`
+([torques](torques.md)) are also reported here."""),
+    "closed_loop": ("Result of closed-loop identification", """These findings describe a fit with `[estimator] name = "simulation"`
+([closed-loop identification](../closed_loop.md))."""),
+    "prediction": ("Validation logs", """These findings describe whether the validation logs test a new motion of the same robot
+([verdict](../../explanation/verdict.md))."""),
+}  # fmt: skip
+FINDINGS_INDEX = """# Findings
+
+A finding is a statement about a log, a URDF or a result. It has a code, a severity, a place (log, joint, link), a message with the remedy, and figures. No
+finding changes data. An example, as `robotid doctor` prints it:
+
+```text
+warning: clipped: first.csv: the torque of elbow_joint is at its limit -20 in
+  31.6 % of the rows while the robot moves: it is clipped, and these rows are
+  wrong; record a slower motion, or remove these rows
+```
+
+| severity | meaning |
+|---|---|
+| error | The result would be wrong. The verdict is *poor*, and no URDF is written. |
+| warning | The result may be wrong. Many warnings limit the verdict to *usable*. |
+| note | A fact. No action is needed unless the note names one. |
+
+The tables state the typical severity; it depends on the figures and on the use of a channel. Words in italics are figures and names, which `--json` prints, too.
+
+- `robotid inspect` reports errors of a URDF. In `robotid identify` they are warnings, and the nearest possible body is used.
+- `robotid doctor --verbose` adds the notes. `result.json` has the findings of a result under [`warnings`](../result_files.md).
+- If you know that a finding is wrong, `ignore = ["urdf_mismatch"]` under `[doctor]` (`--ignore CODE`) removes its effect on the verdict. Only errors and warnings that
+  limit the verdict can be ignored.
+
+This page and the tables are written by `python docs/write_reference.py` from `robotid/diagnosis/catalogue.toml`.
+"""
 
 
 def pages():
@@ -127,7 +192,52 @@ def pages():
     for section in sections:
         table = section.partition("]")[0].strip("`[")
         texts[PAGES.get(table, "job_file.md")].append(section)
-    return {name: "\n## ".join(parts).rstrip() + "\n" for name, parts in texts.items()}
+    written = {name: "\n## ".join(parts).rstrip() + "\n" for name, parts in texts.items()}
+    return written | findings()
+
+
+def findings():
+    """Return the texts of the pages on findings, by file name: an index, and a table for each group."""
+    index, texts = [FINDINGS_INDEX], {}
+    for page, (title, words) in FINDINGS.items():
+        found = {c: e for c, e in entries().items() if e["page"] == page and ":" not in c}
+        index.append(f"## {title}\n\n{', '.join(f'[`{c}`]({page}.md#{c})' for c in found)}\n")
+        rows = [finding_row(code, entry) for code, entry in found.items()]
+        head = "| code | message | cause | remedy |\n|---|---|---|---|"
+        texts[f"findings/{page}.md"] = "\n".join([f"# {title}\n", f"{words}\n", head, *rows]) + "\n"
+    return {"findings/index.md": "\n".join(index), **texts}
+
+
+def finding_row(code, entry):
+    """Return the line of a finding; what follows a colon in its message is the cause if none is stated."""
+    subject, message, cause = re.fullmatch(
+        r"((?:link )?\*\w+\*: )?(.*?)(?:: (.*))?", plain(entry, "message")
+    ).groups("")
+    if "*" in cause and "cause" not in entry:
+        cause, message = "", f"{message}: {cause}"
+    about = entry.get("term") or entry.get("about") or subject + message
+    cells = (about, "" if "term" in entry else entry.get("cause", cause), plain(entry, "remedy"))
+    shown = " | ".join(x if x[1:2].isupper() else x[:1].lower() + x[1:] for x in cells)
+    return f"| `{code}`{{#{code}}} {entry['severity']} | {shown.replace('<', '&lt;')} |"
+
+
+def plain(entry, part):
+    """Return the first sentence of a template, its last choice, names of slots in italics."""
+    text = entry.get(part, "")
+    for _ in range(3):  # parts may contain others
+        for name, parts in entry.items():
+            if isinstance(parts, dict):
+                chosen = [x for x in parts.values() if x != "; no action needed"]
+                text = text.replace(f"{{{name}}}", "" if name in OPTIONAL else chosen[-1])
+    shown = ""
+    for literal, name, spec, _ in Formatter().parse(text.strip(" ;.:,")):
+        unit = next((x for x in (" %", " ms") if spec and spec.rstrip("~").endswith(x)), "")
+        shown += literal
+        if name and name not in OPTIONAL:
+            shown += f"*{name.replace('_', ' ')}*{unit}"
+    shown = re.sub(r" \+- \*[\w ]+\*( ms)?| \([^()]*\*[^()]*\)", "", shown)  # errors, asides
+    first = re.sub(r"^(: |\. |\*cure\*|This explains [^.]*\.? ?|no action needed)+", "", shown)
+    return first.split(". ")[0].strip(" ;.:,")
 
 
 def job_file():

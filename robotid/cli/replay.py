@@ -91,7 +91,7 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
             label = name if name not in results else f"{name} {len(results) + 1}"
             results[label] = load_result(file)
     if len(tracks) > 1:
-        raise DataError(f"{len(tracks)} tracks are given, wanted at most one")
+        raise DataError(f"{len(tracks)} tracks are given, expected at most one")
     folder, track = tracks[0] if tracks else (Path(), None)
     return Findings(results, track, folder, beside[min(1, len(paths))])
 

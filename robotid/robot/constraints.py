@@ -75,13 +75,13 @@ class Contact(Settings):
         for component in require_each(self.measured, str, "measured", f"a list of {listed(known)}"):
             if component not in known or self.measured.count(component) > 1:
                 raise SettingsError(
-                    f"measured of the {self.kind} contact {self.frame!r} has {component!r}, wanted "
-                    f"some of {listed(known)}, each once"
+                    f"measured of the {self.kind} contact {self.frame!r} has {component!r}, "
+                    f"expected some of {listed(known)}, each once"
                 )
         require_flag(self.always, "always")
         if self.radius > 0.0 and self.kind != "point":
             raise SettingsError(
-                f"radius of the {self.kind} contact {self.frame!r} is {self.radius:g}, wanted a "
+                f"radius of the {self.kind} contact {self.frame!r} is {self.radius:g}, expected a "
                 "positive length [m] of a point contact, or 0"
             )
         if self.is_measured:
@@ -143,11 +143,11 @@ class Loop(Settings):
         super().__post_init__()
         if len(self.frames) != 2 or self.frames[0] == self.frames[1]:
             found = listed(self.frames) or "none"
-            raise SettingsError(f"loop has the frames {found}, wanted two links")
+            raise SettingsError(f"loop has the frames {found}, expected two links")
         axis = require_each(self.axis, (int, float), "axis of a loop", "x, y, z")
         if len(axis) != 3 or not 1e-6 < np.linalg.norm(np.array(axis, dtype=float)) < np.inf:
             raise SettingsError(
-                f"axis of loop {listed(self.frames)} is {self.axis}, wanted x, y, z"
+                f"axis of loop {listed(self.frames)} is {self.axis}, expected x, y, z"
             )
 
     @property

@@ -217,7 +217,7 @@ def test_a_base_is_where_the_log_says_or_said_to_be_held(tmp_path, capsys):
     base[:, 3:] *= 0.5
     assert play(np.column_stack([rows, base]), [*columns, *names]) is None
     assert (
-        "log.csv: the quaternion of the base has length 0.5 in row 0, wanted 1"
+        "log.csv: the quaternion of the base has length 0.5 in row 0, expected 1"
         in capsys.readouterr().err
     )
 

@@ -90,7 +90,7 @@ def groups_of(settings: LoopSettings, joints: Sequence[str], alike: Sequence[Any
     for group, members in settings.groups.items():
         if isinstance(members, str) or not isinstance(members, Sequence):
             raise SettingsError(
-                f"controller: groups.{group} is {members!r}, wanted a list of joints"
+                f"controller: groups.{group} is {members!r}, expected a list of joints"
             )
         for joint in members:
             if joint not in joints:
