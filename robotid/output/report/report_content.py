@@ -206,7 +206,7 @@ class Dock:
 
     def _command(self, clip: Clip) -> str:
         words = self.origin.using("replay", self.urdf, clip.log, self.origin.folder)
-        return "".join(words) if clip.log else ""
+        return "".join(map(command_html, words)) if clip.log else ""
 
     def link(self, words: str, start: float, joint: str, log: str) -> str:
         """Return the HTML of a link to a time of the replay; "" without replay."""
@@ -231,7 +231,7 @@ class Dock:
         kind, command = "written", ""
         if not self.replay:
             kind = "unwritten"
-            command = command_html(next(filter(None, map(self._command, self.clips))))
+            command = next(filter(None, map(self._command, self.clips)))
         file, packed = escape(quote(self.file)), escape(json.dumps(clips))
         return block(f"report.{kind}_dock", file=file, clips=packed, command=command)
 

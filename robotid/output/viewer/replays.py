@@ -422,7 +422,7 @@ class Mark:
 
     t: float  # on the clock of the motion [s]
     label: str
-    kind: str = "note"  # "payload", "gap" or "note"
+    kind: str = "note"  # "payload", "gap", "note", or "validation", at which the page starts
     joint: str = ""  # the affected joint, if any
 
 

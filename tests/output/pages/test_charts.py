@@ -278,6 +278,9 @@ def test_a_verdict_shows_three_reasons_and_folds_all_others():
 
 
 def test_a_command_breaks_between_arguments_only():
+    assert "<i>/my &amp; lab/arm/</i>z.urdf</span> <span>run/a.csv" in command_html(
+        "robotid replay '/my & lab/arm/z.urdf' run/a.csv"
+    ).replace("&#x27;", "")
     assert command_html("robotid replay 'my log.csv' --lock a=0 <x>") == (
         '<pre class="command"><span>robotid</span> <span>replay</span> '
         "<span>&#x27;my log.csv&#x27;</span> <span>--lock</span> <span>a=0</span> "

@@ -84,6 +84,8 @@ class Link { // a cursor and a range of x that charts share
     if (how !== "hover") this.time = x;
     this.shown = x;
     for (const chart of this.seen) chart.move();
+    clearTimeout(this.rest); // the others when the cursor rests: after Pause, a click, a key
+    this.rest = setTimeout(() => { for (const chart of all) if (chart.link === this) chart.move(); }, 200);
     for (const listener of this.listeners) listener(x, how);
   }
   leave() { this.set(this.time, "hover"); }
@@ -253,9 +255,10 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
   }
 
   scale() {
-    this.whole.hidden = !this.link.range;
-    if (!this.plot) return;
     const [min, max] = this.window();
+    this.whole.hidden = !this.link.range;
+    this.at.style.minWidth = `${Math.max(...[min, max].map((x) => this.where(x).length))}ch`;
+    if (!this.plot) return;
     this.plot.setScale("x", { min, max });
     this.move();
   }
@@ -279,7 +282,8 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
         bind: { dblclick: () => () => this.link.zoom(null) } },
       scales: { x: { time: false, distr: distribution("x"), range: () => this.window() },
         y: { distr: distribution("y"), range: () => this.extent() } },
-      axes: [axis({ size: 28, label: name || null, labelSize: name ? 20 : 0, labelGap: 2, space: 70,
+      axes: [axis({ size: 28, label: name || null, labelSize: name ? 20 : 0, labelGap: 2,
+        space: (u, i, low, high) => 36 + 7 * String(Math.trunc(high)).length,
         labelFont: "11px system-ui, sans-serif", ...decades("x") }),
       axis({ size: 54, space: 22, ...decades("y") })],
       series: [{}, ...series.map(({ tone: colour, kind, is_weak: weak }, i) => ({ show: !this.hidden.has(i),
