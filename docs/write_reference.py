@@ -134,22 +134,20 @@ OPTIONAL = {
 }
 #: The pages of findings, by the key in the catalogue: title, and what the reader must know first.
 FINDINGS = {
-    "refused": ("Refused logs", """These errors cannot be ignored, and no result is written. `robotid doctor` lists them; `identify` ends with exit code 1. The
-message in the terminal also names the place and the values found."""),
+    "refused": ("Refused logs", """These errors cannot be ignored, and no result is written. The message in the terminal also names the place and the values."""),
     "logs": ("Logs: time stamps, motion, sensors", "These findings need no model of the robot."),
     "bases": ("Logs: floating bases, contacts, loops", """See [legged robots](../../how_to/legged.md) and [closed chains](../../how_to/closed_chains.md)."""),
-    "torques": ("Logs: torques and the URDF", """Before the identification, each log is fitted with masses of 0 or more, friction and motor inertia. "Unexplained" is the share
-of the variance of a torque that this fit leaves. Of several explanations, the best one is reported. A validation error below 5 % turns findings on masses, gravity and
-unexplained torque into notes. [Drive gains](../../how_to/drive_gains.md) shows how to find unknown gains."""),
+    "torques": ("Logs: torques and the URDF", """Before the identification, each log is fitted with masses of 0 or more, friction and motor inertia. "Unexplained" is the share of the
+torque's variance that this fit leaves. The best of several explanations is reported. A validation error below 5 % turns findings on masses, gravity and unexplained torque into
+notes. A known payload determines [unknown gains](../../how_to/drive_gains.md)."""),
     "commands": ("Logs: commands and positions", """These findings describe the loop between the commanded and the measured position of each joint
 ([servo arm](../../tutorials/servo_arm.md))."""),
     "urdf": ("URDF", """`robotid inspect robot.urdf` reports these findings. `com_outside`, `density`, `gyration` and `ellipsoid` are reported for identified bodies,
 too."""),
     "result": ("Result", "These findings describe the identified parameters."),
-    "residual": ("Residual of the fit", """Each candidate is fitted beside all base parameters, and counts by the share of the squared residual that it explains on held-out segments.
-A missing drive term (`friction_shape` to `drift`) is a warning if it explains 25 % or more, is 2 % of the torque or more, and validation logs confirm it. The
-message of a missing term names the setting that adds it: `friction`, `[drives]` or `[[coupling]]` ([friction](../../explanation/friction.md)). `position_offset` and `gravity`
-([torques](torques.md)) are also reported here."""),
+    "residual": ("Residual of the fit", """Each candidate is fitted beside all base parameters, and counts by the share of the squared residual that it explains on held-out segments. A
+missing drive term (`friction_shape` to `drift`) is a warning if it explains 25 %, is 2 % of the torque, and validation logs confirm it. Its message names the setting that adds
+it: `friction`, `[drives]` or `[[coupling]]` ([friction](../../explanation/friction.md)). `position_offset` and `gravity` ([torques](torques.md)) are also reported here."""),
     "closed_loop": ("Result of closed-loop identification", """These findings describe a fit with `[estimator] name = "simulation"`
 ([closed-loop identification](../closed_loop.md))."""),
     "prediction": ("Validation logs", """These findings describe whether the validation logs test a new motion of the same robot
