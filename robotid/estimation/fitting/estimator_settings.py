@@ -230,7 +230,7 @@ class TLSSettings(EstimatorSettings):
     name: str = _called("tls", "total least squares, which also models noise of the regressor")
     regressor_noise: float | None = setting(
         None,
-        "RMS noise of each regressor column, relative to the RMS of the column [-]; if not stated "
+        "RMS noise of each regressor column, relative to the RMS of the column [-]; default: "
         "0.01, at most half of the residual's variance",
         within=Range("x > 0", lambda x: x > 0),
     )
@@ -297,8 +297,8 @@ class SimulationSettings(EstimatorSettings):
 
     name: str = _called(
         "simulation",
-        "closed-loop output error: simulates the controlled robot from the logged commands and "
-        "fits it to the logged positions; [controller] has the known parameters of the controllers",
+        "closed-loop output error: simulates the controlled robot on the logged commands and "
+        "fits it to the logged positions; [controller] has its known parameters",
     )
     window: float | None = setting(
         None, "length of the simulated windows [s]; default 2.5, or 0.5 if the logged torque "
