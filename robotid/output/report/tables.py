@@ -150,13 +150,14 @@ def error_bars(
     # the only validation recording need not be named
     is_alone = len(recordings) == 1 and not recordings[0].is_fitted
     alone = f" on {recordings[0].name}" if is_alone else ""
-    items = []
+    items, said = list[str](), set[str]()
     for joint in [*worst, *(joint for joint in verdicts if joint not in worst)]:
         verdict, row, link, picture = verdicts.get(joint, _UNKNOWN), rows.index(joint), "", ""
         status = verdict["status"]
         reasons = [reason.replace(alone, "") for reason in verdict["reasons"]]
         shown = reasons if status != "good" else [] if items else reasons[-1:]
         why = joint_reason(joint, shown)
+        why, said = "as above" if why and why in said else why, said | {why}
         error = _share(worst[joint]) if joint in worst else None
         if error is not None:
             picture = _picture(quantity, row, joint, error, worst[joint])
@@ -389,7 +390,8 @@ def body_table(identification: TorqueIdentification) -> str:
         for value, half, urdf in zip(*parts, strict=True):
             identified = both(value, half)
             prior = with_error(urdf, half)[0].html
-            html = f'{identified.html}<br><span class="note">{prior}</span>'
+            lines = identified.html.replace(" ± ", "<br>± ")
+            html = f'{lines}<br><span class="note">{prior}</span>'
             cells.append(Cell(html, "number", identified.value))
         rows.append([code(body), *cells])
     units = zip(CENTRAL_TERMS, _CENTRAL_UNITS, strict=True)
