@@ -41,7 +41,7 @@ def tables(printed):
     before, *parts = re.split(r"((?:^\|.*\n)+)", MACHINE.sub("", printed), flags=re.MULTILINE)
     parts[1] = before + "\n" + parts[1]
     for table, notes in zip(parts[::2], parts[1::2], strict=True):
-        lines = [line for line in table.splitlines() if not re.fullmatch(r"[|:-]+", line)]
+        lines = [line for line in table.splitlines() if not re.fullmatch(r"[| :-]+", line)]
         rows = [[cell.strip() for cell in line[1:-1].split("|")] for line in lines]
         yield rows, " ".join(notes.split())
 
