@@ -189,7 +189,6 @@ def demo(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo") / "robotid-demo"
     with pytest.MonkeyPatch.context() as patched:
         leave_out_meshes(patched)
-        patched.setattr("robotid.cli.demo._PERIOD", 7.0)
         assert main(["demo", "--out", str(folder)]) == 0
     return folder
 
