@@ -22,7 +22,7 @@ MACHINE = re.compile(r"Python \d.*(?:x86_64|aarch64|arm64).*")
 
 
 def main():
-    _, *listed = read("tables")
+    listed = [row for row in read("tables") if row[1].startswith("python ")]
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="+", choices=[row[0] for row in listed], metavar="TABLE")
     chosen = parser.parse_args().names
@@ -37,20 +37,13 @@ def main():
 
 
 def tables(printed):
-    """Return the tables that a benchmark printed, each with the text before the next one."""
+    """Yield the rows of each table that a benchmark printed, and the text before the next one."""
     before, *parts = re.split(r"((?:^\|.*\n)+)", MACHINE.sub("", printed), flags=re.MULTILINE)
     parts[1] = before + "\n" + parts[1]
-    return [
-        (
-            [
-                [cell.strip() for cell in line[1:-1].split("|")]
-                for line in table.splitlines()
-                if not re.fullmatch(r"[|:-]+", line)
-            ],
-            " ".join(notes.split()),
-        )
-        for table, notes in zip(parts[::2], parts[1::2], strict=True)
-    ]
+    for table, notes in zip(parts[::2], parts[1::2], strict=True):
+        lines = [line for line in table.splitlines() if not re.fullmatch(r"[| :-]+", line)]
+        rows = [[cell.strip() for cell in line[1:-1].split("|")] for line in lines]
+        yield rows, " ".join(notes.split())
 
 
 def read(name):

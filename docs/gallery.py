@@ -46,7 +46,7 @@ RECORDED = {
     "panda_inria": (
         "Franka Panda, Inria Rennes",
         "Joint torque sensors. The validation motion resembles the identification motion, and the "
-        "verdict states it.",
+        "verdict reports it.",
     ),
     "kinova_gen3": (
         "Kinova Gen3, University of Michigan",
@@ -55,8 +55,8 @@ RECORDED = {
     ),
     "tiago": (
         "TIAGo, LAAS Toulouse",
-        "A verdict of poor: the wrist's currents have a resolution of a few quanta, and no "
-        "estimator can correct that.",
+        "The verdict is poor: the wrist's currents have a resolution of a few quanta. No "
+        "estimator can correct it.",
     ),
 }
 #: Title, lesson, URDF and locked joints of each simulated robot.

@@ -105,6 +105,8 @@ PAGES = dict.fromkeys(
 
 #: Ranges of numbers as the tables have them.
 SHORTER = {
+    "1e-9 to 1e12: a number, or a table of numbers by joint": "> 0, also by joint",
+    "0 to 1e12: a number, or a table of numbers by joint": "≥ 0, also by joint",
     ": a number, or a table of numbers by joint": ", also by joint",
     "0 or a positive number": "≥ 0",
     "a positive number": "> 0",

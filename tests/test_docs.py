@@ -212,18 +212,15 @@ def test_currents_and_a_gripper(follow):
 
 
 def test_from_excitation_to_a_result(follow):
-    printed = follow("tutorials/excitation_to_result.md")
-    assert "verdict: good" in printed
-    share = re.search(r"(\d+)% of \d+ base parameters within", printed)
-    assert int(share[1]) > 80
+    assert "verdict: good" in follow("tutorials/excitation_to_result.md")
 
 
 def test_a_payload_of_two_logs(follow):
-    mass, low, high = re.search(
-        r"mass (\S+) kg \(95 % interval (\S+) to ([^)]+)\)", follow("tutorials/payload.md")
-    ).groups()
-    assert float(low) < 2.0 < float(high)
-    assert float(mass) == pytest.approx(2.0, abs=0.02)
+    printed = follow("tutorials/payload.md")
+    found = re.search(r"mass (\S+) kg \(95 % interval (\S+) to ([^)]+)\)", printed).groups()
+    mass, low, high = map(float, found)
+    assert 1.98 < low < mass < high < 2.02
+    assert low < 2.0 < high
 
 
 def test_a_table_with_any_column_names_is_imported(follow, demo):
