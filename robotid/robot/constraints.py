@@ -24,8 +24,7 @@ class Contact(Settings):
 
     frame: str = setting(
         MISSING,
-        "the link, whose frame is at the point or on the surface of contact; the centre of the "
-        "foot if it has a radius",
+        "the link whose frame is at the contact; at the centre of the foot if it has a radius",
     )
     kind: str = setting(
         "point",
@@ -34,28 +33,32 @@ class Contact(Settings):
     )
     measured: tuple[str, ...] = setting(
         (),
-        "components of the wrench of the ground on the link that logs have as wrench_fz_<link>, of "
-        "fx to mz, with the axes of the world and the origin of the link; the others are unknown",
+        "measured components of the wrench of the ground on the link, fx to mz (columns "
+        "wrench_fz_<link>), at the origin of the link; the others are unknown",
     )
     always: bool = setting(
         False,
         "whether it always touches the ground (true if all components are measured); else logs "
-        "have contact_<link>, 1 or 0, or it is found",
+        "have contact_<link>, or contacts are found",
     )
     radius: float = setting(
         0.0,
-        "of a ball that rolls on level ground: its ground is this far below the frame [m]",
+        "radius of a round foot, which rolls on level ground [m]",
         within=_LENGTH,
     )
     uncertainty: float | None = setting(
         None,
+<<<<<<< HEAD
         "standard deviation of the point of contact along each axis [m], an error of the "
+=======
+        "standard deviation of the point of contact along each axis [m], part of the "
+>>>>>>> main
         "intervals; default: estimated from the logs",
         within=_LENGTH,
     )
     axes: str = setting(
         "world",
-        "axes of the components: world, or link, as a sensor in it measures",
+        "axes of the components: world, or link (a sensor in the link)",
         among=("world", "link"),
         dump=lambda axes: None if axes == "world" else axes,
     )

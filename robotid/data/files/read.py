@@ -395,8 +395,8 @@ def _moves(
     table: Table, units: LogUnits, prismatic: Collection[str], joint: str, column: str
 ) -> bool:
     """Return whether the position of a joint changes in its column."""
-    _, scale = units.scale(joint, is_angle=joint not in prismatic)
-    return bool(scale * np.ptp(table.read([column])[column]) > STILL)
+    values = units.scale(joint, is_angle=joint not in prismatic)[1] * table.read([column])[column]
+    return bool(len(values) and np.ptp(values) > STILL)
 
 
 def _notes_of_sensors(

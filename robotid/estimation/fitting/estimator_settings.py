@@ -297,8 +297,8 @@ class SimulationSettings(EstimatorSettings):
 
     name: str = _called(
         "simulation",
-        "closed-loop output error: simulates the controlled robot from the logged commands and "
-        "fits it to the logged positions; [controller] has the known parameters of the controllers",
+        "closed-loop output error: simulates the controlled robot on the logged commands and "
+        "fits it to the logged positions; [controller] has its known parameters",
     )
     window: float | None = setting(
         None, "length of the simulated windows [s]; default 2.5, or 0.5 if the logged torque "

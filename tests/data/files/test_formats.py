@@ -364,6 +364,10 @@ def test_parquet_columns_become_numbers_or_are_refused(tmp_path):
                    tmp_path / "run.parquet")  # fmt: skip
     with refused("run.parquet: time contains timestamp[ns], expected numbers; convert it"):
         read_log(tmp_path / "run.parquet", ["a"])
+    empty = dict.fromkeys(["t", "q_a", "q_b", "tau_a"], np.empty(0))
+    pq.write_table(pa.table(empty), tmp_path / "run.parquet")
+    with pytest.raises(DataError, match=r"^run\.parquet has no column 'tau_b'"):
+        read_log(tmp_path / "run.parquet", ["a", "b"])
 
 
 def test_tables_of_texts_are_read_from_csv_and_parquet(tmp_path):
