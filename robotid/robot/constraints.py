@@ -48,11 +48,7 @@ class Contact(Settings):
     )
     uncertainty: float | None = setting(
         None,
-<<<<<<< HEAD
-        "standard deviation of the point of contact along each axis [m], an error of the "
-=======
         "standard deviation of the point of contact along each axis [m], part of the "
->>>>>>> main
         "intervals; default: estimated from the logs",
         within=_LENGTH,
     )

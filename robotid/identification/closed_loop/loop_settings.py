@@ -33,15 +33,6 @@ class LoopSettings(Settings):
         "relative to gravity and inertia of the bodies", **GAIN,
     )  # fmt: skip
     kd: PerJoint | None = setting(
-<<<<<<< HEAD
-        None, "speed gain [N m s/rad or N s/m], for all joints or by joint; default: "
-        "part of the viscous friction, unless the logs have speed commands or torques", **LEVEL,
-    )  # fmt: skip
-    limit: PerJoint | str | None = setting(
-        None,
-        "torque limit of the drive [N m or N], for all joints or by joint; default: "
-        "fitted where the drive saturates; 'find': fitted for every joint",
-=======
         None, "speed gain [N m s/rad or N s/m], for all joints or by joint; default: part of the "
         "viscous friction, or fitted if the logs have speed commands or torques", **LEVEL,
     )  # fmt: skip
@@ -49,7 +40,6 @@ class LoopSettings(Settings):
         None,
         "torque limit of the drive [N m or N], for all joints or by joint; default: fitted "
         "where the drive saturates; 'find': fitted for every joint",
->>>>>>> main
         reads=(int, float, dict, str),
         within=GAIN["within"],
         among=("find",),
@@ -63,11 +53,7 @@ class LoopSettings(Settings):
     )  # fmt: skip
     rate: float | None = setting(
         None, "sampling rate of a discrete-time controller, which holds its torque until the next "
-<<<<<<< HEAD
-        "sample [Hz]; default: the controller is in continuous time", within=_CLOCK,
-=======
         "sample [Hz]; default: continuous time", within=_CLOCK,
->>>>>>> main
     )  # fmt: skip
     gravity_compensation: bool = setting(
         False, "whether the controller adds the gravity torque of the URDF"
