@@ -32,7 +32,7 @@ def echo(text: str, indent: str = "", tone: str = "") -> None:
 
 
 def print_files(names: Sequence[str], folder: str = "") -> None:
-    echo(f"\nwritten{folder and f' to {folder}'}: {', '.join(names)}", "  ")
+    print(f"\nwritten{folder and f' to {folder}'}: {', '.join(names)}")
 
 
 def print_steps(steps: "Sequence[Step]") -> None:
