@@ -102,15 +102,11 @@ class _Motion:
 
     def inertial(self) -> Array:
         """Return the columns of the limb's bodies, shape (N, m, p)."""
-        v, a = self.clock * self.v, self.clock**2 * self.a
-        rows, bodies = np.nonzero(self.model.support[:, : len(self.spread) : 10])
-        row = np.full(v.shape[1], -1)
-        row[self.rows] = np.arange(len(self.rows))
-        own = row[rows] >= 0
-        values = inertial_rows(self.model, self.q, v, a).values.T.reshape(len(v), -1, 10)
-        columns = np.zeros((len(v), len(self.rows), len(self.spread) // 10, 10))
-        columns[:, row[rows[own]], bodies[own]] = values[:, own]
-        return columns.reshape(*columns.shape[:2], -1)[..., self.moved]
+        every = inertial_rows(self.model, self.q, self.clock * self.v, self.clock**2 * self.a)
+        X = np.zeros((len(self.q), len(self.rows), len(self.spread)))
+        for k, j in enumerate(self.rows):
+            X[:, k, every.columns[j]] = every.values[every.first[j] : every.first[j + 1]].T
+        return X[..., self.moved]
 
 
 @dataclass(frozen=True, eq=False)
