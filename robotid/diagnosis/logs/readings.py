@@ -35,7 +35,7 @@ _LOOSE = 10.0  # prior deviation of the bodies, in sizes of the URDF's
 _FEW = 24  # instants with which the readings are chosen that are tried with all
 _SEGMENTS = 8  # of the log that are held out in turn
 _BODIES = 20  # of a limb, at most
-_TRIED = 5  # readings that are tried with all instants
+_TRIED = 10  # readings that are tried with all instants
 _TILT = 0.35  # tangent of the angle of a base that is not level
 _OFFSET = 0.4  # [rad] of a zero position
 _DRIVE = 4  # columns of a drive: offset, armature, viscous and Coulomb friction
@@ -83,12 +83,14 @@ class _Motion:
             gravity, inertia = (x[self.rows, None] for x in (self.gravity, self.inertia))
             X = inertia * (X - weight) + gravity * weight
             urdf = X @ pi - self.subtracted * (weight @ pi)
+        spread = self.spread[self.moved]
         drive = drive_columns(self.model, self.q, self.v, self.a)[:, self.rows]
         level = np.sqrt(np.mean(self.tau**2, axis=0).max())
         drive *= level / (np.sqrt(np.mean(drive**2, axis=0)) + _FLOOR)
         coupled, drive = drive[..., _DRIVE:], drive[..., :_DRIVE]
         logged = np.repeat(self.tau[:, None], len(self.rows), axis=1)
-        columns = [X * self.spread[self.moved], coupled, drive, urdf[..., None], logged]
+        bodies = (X * spread)[..., spread > 0.0]
+        columns = [bodies, coupled, drive, urdf[..., None], logged]
         P = np.concatenate(columns, axis=2).swapaxes(0, 1)
         edges = np.linspace(0, len(self.tau), self.segments + 1).astype(int).tolist()
         parts = [P[:, i:k] for i, k in pairwise(edges)]
@@ -456,16 +458,17 @@ def _best(samples: Samples) -> Best | None:
     few = samples.few()
     if few.share.max() < _POOR:
         return None
-    gains: dict[tuple[str, tuple[int, ...]], tuple[float, int, Reading]] = {}
-    for i, reading in enumerate(readings(few, bool(few.share.max() > _GROSS))):
-        gain = misfit(few.share) - misfit(reading.of(few).share)
-        if gain > gains.get((reading.code, reading.joints), (0.5 * CERTAIN,))[0]:
-            gains[reading.code, reading.joints] = gain, i, reading
-    tried = sorted(gains.values(), key=lambda x: -x[0])[:_TRIED]
+    spread = np.where(np.arange(len(few.motion.spread)) % 10 < 4, few.motion.spread, 0.0)
+    fewer = few.changed(spread=spread)  # parameters: masses and first moments
+    every = enumerate(readings(fewer, bool(few.share.max() > _GROSS)))
+    gains = [(misfit(fewer.share) - misfit(r.of(fewer).share), i, r) for i, r in every]
+    tried = sorted((x for x in gains if x[0] > 0.5 * CERTAIN), key=lambda x: -x[0])[:_TRIED]
     refined = [(reading.refined(few, 8), i) for _, i, reading in tried]
     left = {r: (misfit(r.of(samples).share), len(r.joints), i) for r, i in refined}
     least = min(left.values(), default=(0.0,))[0] + _ALIKE
-    alike = [r for r in sorted(left, key=lambda r: left[r][1:]) if left[r][0] < least]
+    starts = {(r.code, r.joints): r for r in sorted(left, key=lambda r: left[r], reverse=True)}
+    close = [r for r in starts.values() if left[r][0] < least]
+    alike = sorted(close, key=lambda r: left[r][1:])  # the simplest first
     if not alike:
         return None
     best = alike[0].refined(few, 20)
