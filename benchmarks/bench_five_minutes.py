@@ -1,8 +1,8 @@
 """From files to a verdict with nothing but the README: commands typed, errors met, seconds waited.
 
 The robot is an arm with a gripper whose drives are logged as currents and whose wrist is coupled:
-its URDF, and two logs. One user copies the README's commands and fills its recipes with names and
-figures of this robot. Another reads no recipe, types the command line, adds the flags that the
+its URDF, and two logs. One user copies the README's commands and fills its job file with names and
+figures of this robot. Another does not read it, types the command line, adds the flags that the
 errors name, and writes the job file when a finding asks for what has no flag.
 
     python benchmarks/bench_five_minutes.py
@@ -111,20 +111,12 @@ def block(marker):
 
 
 def own_job():
-    """Return the README's recipes in one job file, with the names and figures of this robot."""
-    tables = {"": []}
-    for recipe in ("gripper", "currents", "coupled"):
-        table = ""
-        for line in block(f"job: {recipe}").splitlines():
-            table = line if line.startswith("[") else table
-            lines = tables.setdefault(table, [])
-            key = line.partition(" = ")[0]
-            if key in OWN:
-                values = ", ".join(f"{name} = {value}" for name, value in OWN[key].items())
-                line = f"{key} = {{ {values} }}"
-            if line and not line.startswith("[") and line not in lines:
-                lines.append(line)
-    return "\n\n".join("\n".join([name, *lines]) for name, lines in tables.items()) + "\n"
+    """Return the README's job file, with the names and figures of this robot."""
+    text = block("job: arm")
+    for key, own in OWN.items():
+        values = ", ".join(f"{name} = {value}" for name, value in own.items())
+        text = re.sub(rf"(?m)^{key} = .*", f"{key} = {{ {values} }}", text)
+    return text
 
 
 def reads(user):

@@ -165,6 +165,15 @@ PLANTS = {
 }  # fmt: skip
 WITH_TORQUES = [name for name in PLANTS if name != "icub"]
 
+COVERAGE = (
+    "| robot | joints | runs | coverage of base parameters | of masses | total mass | true |\n"
+    + "|---" * 7 + "|"
+)  # fmt: skip
+UNSEEN = (
+    "| robot | run | fit | joint torque error | URDF | with fitted drives | least squares | "
+    "trunk's mass / true | its Ixx / true |\n" + "|---" * 9 + "|"
+)
+
 
 def of_urdf(seed):
     """Return the source of a URDF's differences."""
@@ -175,11 +184,7 @@ def coverage(name, seeds, duration):
     plant = PLANTS[name]()
     model = plant.model
     truth, n = plant.truth(model), model.layout.n_inertial
-    print(
-        f"{name}\n{'run':>4} {'covered':>8} {'of':>4} {'rms z':>6} {'masses':>8} "
-        f"{'total mass [kg]':>16} {'its z':>6} {'s':>6}"
-    )
-    shares, of_masses = [], []
+    shares, of_masses, totals = [], [], []
     signals = getattr(plant, "signals", SIGNALS)
     for seed in seeds:
         rng = np.random.default_rng(seed)
@@ -191,7 +196,7 @@ def coverage(name, seeds, duration):
                 doctor=False,
             )  # fmt: skip
         except (RankDeficientError, NotConvergedError) as error:
-            print(f"{seed:4} {str(error)[:60]}")
+            print(f"{seed:4} {str(error)[:60]}", file=sys.stderr)
             continue
         spent = time.process_time() - start
         is_body = (found.mapping.independent < n) & (found.base_error > 0.0)  # not negligible links
@@ -202,17 +207,20 @@ def coverage(name, seeds, duration):
         own = truth[masses]
         is_free = high - low > 1e-6 * own.sum()  # links of negligible mass keep the URDF's
         of_masses.append(np.mean(((low <= own) & (own <= high))[is_free]))
-        shares.append(np.mean(np.abs(z) < found.errors.quantile[is_body]))
+        shares.append(100 * np.mean(np.abs(z) < found.errors.quantile[is_body]))
+        totals.append(mass)
         print(
-            f"{seed:4} {100 * shares[-1]:7.0f}% {len(z):4} {np.sqrt(np.mean(z**2)):6.2f} "
-            f"{100 * of_masses[-1]:7.0f}% {mass:16.3f} {(mass - own.sum()) / np.sqrt(error):6.2f} "
-            f"{spent:6.1f}",
-            flush=True,
+            f"{name} {seed}: {shares[-1]:.0f} % of {len(z)}, RMS z {np.sqrt(np.mean(z**2)):.2f}, "
+            f"total mass {(mass - own.sum()) / np.sqrt(error):.2f} std. errors off, {spent:.1f} s",
+            file=sys.stderr,
         )
     if shares:
         print(
-            f"mean {100 * np.mean(shares):7.1f}%, of masses {100 * np.mean(of_masses):.1f} %, "
-            f"wanted 90 to 98 %; total mass true {truth[:n:10].sum():.3f} kg"
+            f"| {name} | {len(model.joints)} | {len(shares)} "
+            f"| {np.mean(shares):.1f} % ({min(shares):.0f} to {max(shares):.0f} %) "
+            f"| {100 * np.mean(of_masses):.1f} % | {min(totals):.2f} to {max(totals):.2f} kg "
+            f"| {truth[:n:10].sum():.2f} kg |",
+            flush=True,
         )
 
 
@@ -249,7 +257,6 @@ def unseen(name, seed, duration):
     other = with_other_bodies(model, of_urdf(seed))
     fitted, rest = log.window(end=0.7 * duration), log.window(0.7 * duration)
     truth = plant.truth(model)[:n]
-    print(f"{name}, run {seed}: joint torque of unseen motion, trunk's mass and Ixx / truth")
     for label, settings in (
         ("wls", "wls"), ("weak prior", WEAK_PRIOR), ("consistent", PRIOR)
     ):  # fmt: skip
@@ -259,7 +266,7 @@ def unseen(name, seed, duration):
                 friction="none", doctor=False,
             )  # fmt: skip
         except (RankDeficientError, NotConvergedError) as error:
-            print(f"  {label:14} {str(error)[:50]}")
+            print(f"{name} {seed}, {label}: {str(error)[:50]}", file=sys.stderr)
             continue
         (own,) = found.validation
         first = model.n_rows - len(model.joints)
@@ -270,9 +277,9 @@ def unseen(name, seed, duration):
         }
         trunk = found.standard[[0, 4]] / truth[[0, 4]]
         print(
-            f"  {label:14} {errors['estimate']:6.2f} % (URDF {errors['urdf']:.1f} %, with fitted "
-            f"drives {errors['urdf_with_drives']:.1f} %; without bounds, undetermined parameters "
-            f"of the URDF {errors['wls']:.2f} %) {trunk[0]:6.2f} {trunk[1]:6.2f}",
+            f"| {name} | {seed} | {label} | {errors['estimate']:.2f} % | {errors['urdf']:.1f} % "
+            f"| {errors['urdf_with_drives']:.1f} % | {errors['wls']:.2f} % | {trunk[0]:.2f} "
+            f"| {trunk[1]:.2f} |",
             flush=True,
         )
 
@@ -346,6 +353,8 @@ def main():
     parser.add_argument("--faults", action="store_true", help="only wrong poses")
     options = parser.parse_args()
     runs, seconds = (1, 4.0) if options.quick else (options.runs, options.seconds)
+    if not options.faults:
+        print(UNSEEN if options.unseen else COVERAGE)
     for name in ("go1", "cassie") if options.quick else options.robots:
         if options.faults:
             faults(name, range(options.first, options.first + runs), seconds)
@@ -358,6 +367,7 @@ def main():
         if "ROBOTID_DATA" in os.environ:
             trot()
         speed(min(6.0, seconds))
+    print(setting.machine())
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """What a second motion adds.
 
-    python benchmarks/bench_motions.py [--picture] [--quick]
+    python benchmarks/bench_motions.py [--quick]
 
 A second motion: a first one is simulated with noise of 2 % in the torque and identified; then
 ``robotid preview --given`` says by how much each second motion of 10 s narrows the widest quarter
@@ -10,7 +10,6 @@ were known (criteria D and A), and one designed with ``--given``. The first is e
 half of the ranges.
 
 Every design has one start, and is followed until it settles; collisions are not looked at.
-``--picture`` writes docs/pictures/next_motion.svg.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
@@ -38,7 +37,6 @@ SECOND = {
     "fresh, criterion A": ("--criterion", "A"),
     "--given the first": ("--given",),
 }
-PICTURE = Path(__file__).resolve().parents[1] / "docs" / "pictures" / "next_motion.svg"
 
 
 def recorded(urdf, target, seed):
@@ -97,43 +95,11 @@ def second_motions(seeds):
     return all_of_them
 
 
-def draw(found):
-    """Write the picture of what second motions add."""
-    import matplotlib
-
-    matplotlib.use("svg")
-    matplotlib.rcParams.update({"svg.hashsalt": "robotid", "font.size": 9})
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, len(found), figsize=(9.0, 2.6), sharey=True)
-    for axis, ((robot, first), by_name) in zip(axes, found.items(), strict=True):
-        for k, (name, values) in enumerate(by_name.items()):
-            colour = "#c44e00" if name.startswith("--given") else "#44617b"
-            axis.plot(values, np.full(len(values), -k), "o", color=colour, alpha=0.5, ms=4)
-            axis.plot(values.mean(), -k, "|", color=colour, ms=16, mew=2)
-        axis.set_title(f"{robot}\nfirst: {first}", fontsize=9)
-        axis.set_xlim(left=0)
-        axis.grid(axis="x", alpha=0.3)
-        for side in ("top", "right"):
-            axis.spines[side].set_visible(False)
-    axes[0].set_yticks(-np.arange(len(SECOND)), list(SECOND))
-    axes[0].set_ylim(-len(SECOND) + 0.5, 0.5)
-    figure.supxlabel("the widest quarter of the intervals is cut by [%]; a dot per seed, bar: mean",
-                     fontsize=9)  # fmt: skip
-    figure.tight_layout()
-    figure.savefig(PICTURE, metadata={"Date": None})
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--picture", action="store_true", help="also draw the gain of second motions"
-    )
     parser.add_argument("--quick", action="store_true", help="one seed, as a trial")
     options = parser.parse_args()
-    found = second_motions(1 if options.quick else 5)
-    if options.picture:
-        draw(found)
+    second_motions(1 if options.quick else 5)
     print(f"\n{setting.machine()}")
 
 

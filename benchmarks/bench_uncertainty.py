@@ -120,11 +120,11 @@ class Study:
         ratio = np.sqrt((se**2).mean(axis=0) / (error**2).mean(axis=0))
         reach = quantile(np.array([np.inf]))[0]
         return (
-            f"{ratio.min():5.2f} {np.median(ratio):5.2f} {ratio.max():5.2f}   "
-            f"{100 * np.mean((ratio > 0.8) & (ratio < 1.3)):4.0f} %   "
-            f"{100 * is_held.mean():5.1f} %   "
-            f"{np.sqrt((band**2).mean() / (torque**2).mean()):5.2f}  "
-            f"{100 * (np.abs(torque) <= reach * band).mean():5.1f} %"
+            f"{ratio.min():.2f}, {np.median(ratio):.2f}, {ratio.max():.2f} | "
+            f"{100 * np.mean((ratio > 0.8) & (ratio < 1.3)):.0f} % | "
+            f"{100 * is_held.mean():.1f} % | "
+            f"{np.sqrt((band**2).mean() / (torque**2).mean()):.2f} | "
+            f"{100 * (np.abs(torque) <= reach * band).mean():.1f} %"
         )
 
 
@@ -165,8 +165,8 @@ class EncoderStudy:
     def row(self, key):
         z, reach = (np.array(values) for values in zip(*self.z[key], strict=True))
         return (
-            f"{100 * np.mean(z <= reach):5.1f} %  {np.sqrt(np.mean(z**2)):5.2f}  "
-            f"{np.median(self.shifts):6.2f}  {self.named:3}"
+            f"{100 * np.mean(z <= reach):.1f} % | {np.sqrt(np.mean(z**2)):.2f} | "
+            f"{np.median(self.shifts):.2f} | {self.named}"
         )
 
 
@@ -194,17 +194,16 @@ def torque(model, pi, q, v, a):
 
 def print_encoders(robots, frictions, bits, runs):
     print(f"{runs} runs each; inertial base parameters; torque noise {100 * ENCODER_NOISE:g} %")
-    print("robot  bits  motion    friction         estimator    coverage   rms z   shift  named")
+    print("| robot | bits | motion | friction | estimator | coverage | RMS z | shift | named |")
+    print("|---" * 9 + "|")
     for name, period, friction, bit in itertools.product(
         robots, (DURATION, DURATION / 2), frictions, bits
     ):
         study = EncoderStudy(name, bit, period, friction, runs)
         motion = "once" if period == DURATION else "twice"
         for key in study.z:
-            print(
-                f"{name:6} {bit:4}  {motion:8}  {friction:15}  {key:12} {study.row(key)}",
-                flush=True,
-            )
+            row = f"| {name} | {bit} | {motion} | {friction} | {key} | {study.row(key)} |"
+            print(row, flush=True)
 
 
 def main():
@@ -234,15 +233,17 @@ def main():
     )
     print(setting.machine())
     print(f"{runs} runs each; ratio = reported standard error / root mean square of the error")
-    print("robot  signals  noise     URDF  estimator    ratio: min, median, max, share in 0.8-1.3;")
-    print("coverage; band of the torque: ratio, coverage")
+    print("| robot | signals | noise | URDF | estimator | ratio: min, median, max | in 0.8-1.3 "
+          "| coverage | ratio of the torque band | its coverage |")  # fmt: skip
+    print("|---" * 10 + "|")
     cases = [(*case, None) for case in itertools.product(robots, CHAINS, NOISES)]
     cases += [(name, chain, "white", MOVED) for name, chain in itertools.product(robots, CHAINS)]
     for name, chain, kind, moved in [cases[0], cases[-1]] if options.quick else cases:
         study = Study(name, chain, kind, runs, moved)
         urdf = "near" if moved is None else "far"
         for key in study.found:
-            print(f"{name:6} {chain:8} {kind:9} {urdf:5} {key:12} {study.row(key)}", flush=True)
+            row = f"| {name} | {chain} | {kind} | {urdf} | {key} | {study.row(key)} |"
+            print(row, flush=True)
 
 
 if __name__ == "__main__":

@@ -1,86 +1,74 @@
-"""Run benchmarks and write what they print into the pages under docs/.
+"""Run benchmarks and write the tables that they print as CSV files in docs/evidence/.
 
-    python benchmarks/write_tables.py validation regressor startup ...
+    python benchmarks/write_tables.py accuracy regressor ...
 
-What stands between the marks of a page is what the benchmark printed, with its command, versions
-and machine; the mark keeps a digest of it, so that tests/test_docs.py sees a figure typed by hand.
-A mark with "-" for its digest holds figures of an earlier run, to be written anew.
+docs/evidence/tables.csv lists the tables: the command that prints each, versions and machine, what
+is printed around it, and a digest, by which tests/test_docs.py notices figures typed by hand.
 """
 
 import argparse
+import csv
 import hashlib
-import platform
 import re
+import shlex
 import subprocess
 import sys
 from importlib.metadata import version
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = {
-    "five_minutes": "tutorials/first_arm.md",
-    "validation": "evidence/accuracy.md",
-    "priors": "evidence/new_motion.md",
-    "uncertainty": "evidence/intervals.md",
-    "end_to_end": "evidence/speed.md",
-    "figaroh": "evidence/speed.md",
-    "fuzz": "reference/limits.md",
-    "friction": "evidence/friction.md",
-    "regressor": "evidence/speed.md",
-    "startup": "evidence/speed.md",
-    "scaling": "evidence/speed.md",
-    "workers": "how_to/long_logs.md",
-    "memory": "how_to/long_logs.md",
-    "verdict": "evidence/verdicts.md",
-    "preview": "how_to/preview.md",
-    "excitation": "evidence/excitation.md",
-    "designs": "evidence/excitation.md",
-    "motions": "evidence/excitation.md",
-    "commands": "evidence/closed_loop.md",
-}
-BLOCK = re.compile(
-    r"<!-- table of bench_(?P<name>\w+), (?P<digest>[-\w]+) -->\n"
-    r"(?P<body>.*?)<!-- end of table -->",
-    re.DOTALL,
-)
+FOLDER = ROOT / "docs" / "evidence"
+MACHINE = re.compile(r"Python \d.*(?:x86_64|aarch64|arm64).*")
 
 
 def main():
+    listed = [row for row in read("tables") if row[1].startswith("python ")]
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("names", nargs="+", choices=PAGES)
-    parser.add_argument("--options", default="", help='of the benchmark: --options="--cpu"')
-    options = parser.parse_args()
-    for name in options.names:
-        words = [f"benchmarks/bench_{name}.py", *options.options.split()]
-        run = subprocess.run(
-            [sys.executable, *words], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True
-        )
-        page = ROOT / "docs" / PAGES[name]
-        page.write_text(put(page.read_text(), name, body(run.stdout, " ".join(words))))
-        print(f"{page.relative_to(ROOT)}: table of bench_{name}")
+    parser.add_argument("names", nargs="+", choices=[row[0] for row in listed], metavar="TABLE")
+    chosen = parser.parse_args().names
+    for command in dict.fromkeys(row[1] for row in listed if row[0] in chosen):
+        words = [sys.executable, *shlex.split(command)[1:]]
+        run = subprocess.run(words, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
+        made = version("robotid"), MACHINE.search(run.stdout)[0]
+        names = [row[0] for row in listed if row[1] == command]
+        for name, (table, notes) in zip(names, tables(run.stdout), strict=True):
+            write(name, table, *made, notes)
+            print(f"{name}.csv")
 
 
-def body(printed, command):
-    """Return what a page shows of a benchmark's output."""
-    is_table = any(line.startswith("|") for line in printed.splitlines())
-    shown = printed.strip() if is_table else f"```text\n{printed.strip()}\n```"
-    made = f"`python {command}`, robotid {version('robotid')}"
-    if not re.search(r"Python \d", printed):
-        made += f", Python {platform.python_version()}, {platform.machine()}"
-    return f"{shown}\n\n*{made}*\n"
+def tables(printed):
+    """Yield the rows of each table that a benchmark printed, and the text before the next one."""
+    before, *parts = re.split(r"((?:^\|.*\n)+)", MACHINE.sub("", printed), flags=re.MULTILINE)
+    parts[1] = before + "\n" + parts[1]
+    for table, notes in zip(parts[::2], parts[1::2], strict=True):
+        lines = [line for line in table.splitlines() if not re.fullmatch(r"[| :-]+", line)]
+        rows = [[cell.strip() for cell in line[1:-1].split("|")] for line in lines]
+        yield rows, " ".join(notes.split())
 
 
-def put(text, name, shown):
-    """Return a page with the table of a benchmark replaced."""
-    old = next((m for m in BLOCK.finditer(text) if m["name"] == name), None)
-    if old is None:
-        raise SystemExit(f"the page has no '<!-- table of bench_{name}, - -->' to write to")
-    mark = f"<!-- table of bench_{name}, {digest(shown)} -->\n{shown}<!-- end of table -->"
-    return text[: old.start()] + mark + text[old.end() :]
+def read(name):
+    """Return the rows of a table, its head first."""
+    with (FOLDER / f"{name}.csv").open(newline="") as file:
+        return list(csv.reader(file))
 
 
-def digest(shown):
-    return hashlib.sha256(shown.encode()).hexdigest()[:16]
+def write(name, rows, *made):
+    """Write a table; list its digest, and the version, machine and notes if these are given."""
+    save(name, rows)
+    listed = {row[0]: row for row in read("tables")}
+    if made:
+        listed[name][2:5] = made
+    listed[name][5] = digest(name)
+    save("tables", listed.values())
+
+
+def save(name, rows):
+    with (FOLDER / f"{name}.csv").open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
+
+
+def digest(name):
+    return hashlib.sha256((FOLDER / f"{name}.csv").read_bytes()).hexdigest()[:16]
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
     python docs/gallery.py [NAME ...]
 
-It writes to build/gallery, which the site takes in. Recordings are read from the folder that the
+It writes to build/gallery, as the build of the site does if there is none. Recordings are read from the folder that the
 variable ROBOTID_DATA names; without it the gallery has the simulated robots alone.
 """
 
@@ -46,7 +46,7 @@ RECORDED = {
     "panda_inria": (
         "Franka Panda, Inria Rennes",
         "Joint torque sensors. The validation motion resembles the identification motion, and the "
-        "verdict states it.",
+        "verdict reports it.",
     ),
     "kinova_gen3": (
         "Kinova Gen3, University of Michigan",
@@ -55,8 +55,8 @@ RECORDED = {
     ),
     "tiago": (
         "TIAGo, LAAS Toulouse",
-        "A verdict of poor: the wrist's currents have a resolution of a few quanta, and no "
-        "estimator can correct that.",
+        "The verdict is poor: the wrist's currents have a resolution of a few quanta. No "
+        "estimator can correct it.",
     ),
 }
 #: Title, lesson, URDF and locked joints of each simulated robot.
@@ -89,10 +89,14 @@ FLAT = 1e-9  # [m] outlines that are smaller in a direction have no area
 
 
 def main():
-    """Build the entries that are named, or all, and list those that exist."""
+    """Build the entries that are named on the command line, or all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", metavar="NAME")
-    names = parser.parse_args().names
+    build_entries(parser.parse_args().names)
+
+
+def build_entries(names=()):
+    """Build the entries of some names, or all, and list them."""
     recorded = RECORDED if os.environ.get("ROBOTID_DATA") else {}
     entries = []
     for name in ["demo", *recorded, *SIMULATED]:

@@ -2,7 +2,8 @@
 
     python docs/notebook.py
 
-runs its cells and writes their outputs to build/notebook, which the site then shows.
+runs its cells and writes their outputs to build/notebook, as the build of the site does if there
+are none.
 """
 
 import ast

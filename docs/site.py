@@ -1,7 +1,7 @@
 """Hooks of the site: a page for each command, for each robot of the gallery, and the notebook.
 
-``mkdocs build -f .mkdocs.yml`` calls them. ``python docs/gallery.py`` builds the gallery,
-``python docs/notebook.py`` the outputs of the notebook.
+``mkdocs build -f .mkdocs.yml`` calls them. The gallery and the outputs of the notebook are built
+where build/gallery and build/notebook are missing: remove these folders to build them again.
 """
 
 import argparse
@@ -19,13 +19,16 @@ from mkdocs.structure.files import File
 from robotid.cli import COMMANDS
 
 sys.path.append(str(Path(__file__).parent))
+import gallery
 import notebook
-
-GALLERY = Path(__file__).parents[1] / "build" / "gallery"
 
 
 def on_config(config):
-    """Add the robots of the gallery to the navigation."""
+    """Build what is missing, and add the robots of the gallery to the navigation."""
+    if not notebook.OUTPUTS.exists():
+        notebook.run()
+    if not (gallery.GALLERY / "entries.json").exists():
+        gallery.build_entries()
     for part in config["nav"]:
         if "Gallery" in part:
             part["Gallery"] = ["gallery.md", *(f"gallery/{name}.md" for name in entries())]
@@ -58,21 +61,20 @@ def on_page_markdown(markdown, page, **_):
 
 def on_post_build(config):
     """Copy the reports and replays of the gallery, and the outputs of the notebook."""
-    for made, folder in ((GALLERY, "gallery"), (notebook.OUTPUTS, "tutorials/first_steps")):
+    for made, folder in ((gallery.GALLERY, "gallery"), (notebook.OUTPUTS, "tutorials/first_steps")):
         if made.exists():
             shutil.copytree(made, Path(config["site_dir"]) / folder, dirs_exist_ok=True)
 
 
 @cache
 def entries():
-    """Return the entries of the gallery by name; none where it was not built."""
-    path = GALLERY / "entries.json"
-    return {e["name"]: e for e in json.loads(path.read_text())} if path.exists() else {}
+    """Return the entries of the gallery by name."""
+    return {e["name"]: e for e in json.loads((gallery.GALLERY / "entries.json").read_text())}
 
 
 def gallery_card(entry):
     """Return the card of a robot: its picture, what it teaches and the command."""
-    picture = (GALLERY / entry["name"] / "picture.svg").read_text()
+    picture = (gallery.GALLERY / entry["name"] / "picture.svg").read_text()
     return (
         f'<div class="robot">\n<a href="gallery/{entry["name"]}.html">{picture}'
         f"<strong>{entry['title']}</strong></a>\n"
@@ -93,7 +95,7 @@ def frames(folder):
     return "\n\n".join(
         f'<iframe src="{folder}/{page}.html" title="{page} of {Path(folder).name}" '
         f'loading="lazy" style="width:100%;height:36rem;border:1px solid #8884"></iframe>\n\n'
-        f"[Open the {page} in a tab of its own]({folder}/{page}.html){{target=_blank}}"
+        f'<a href="{folder}/{page}.html" target="_blank">Open the {page} in a tab of its own</a>'
         for page in ("report", "replay")
     )
 

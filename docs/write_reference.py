@@ -1,11 +1,13 @@
 """Write the pages of the reference that follow from the code.
 
-``python docs/write_reference.py`` writes the keys of job files and of plants.
+``python docs/write_reference.py`` writes the keys of job files and of plants, and the findings.
 """
 
 import math
+import re
 from dataclasses import MISSING
 from pathlib import Path
+from string import Formatter
 
 from robotid.cli.job import Job, LogEntry, PayloadEntry
 from robotid.data.signal_settings import (
@@ -15,6 +17,7 @@ from robotid.data.signal_settings import (
     SignalSettings,
     Transmission,
 )
+from robotid.diagnosis.catalogue import entries
 from robotid.dynamics.simulation.simulation_settings import Simulation
 from robotid.estimation.fitting.estimator_settings import ESTIMATORS, ConstraintSettings
 from robotid.identification.closed_loop.loop_settings import LoopSettings
@@ -25,18 +28,15 @@ from robotid.robot.parameters import Coupling
 REFERENCE = Path(__file__).with_name("reference")
 PLANT = """# Keys of a plant
 
-`robotid simulate --plant plant.toml` reads these keys; [Simulating a log](../how_to/simulate.md) explains them. A flag
-overrides the file. This page is written by `python docs/write_reference.py` from the settings in the code.
+`robotid simulate --plant plant.toml` reads these keys ([simulating a log](../how_to/simulate.md)). A flag overrides the file.
 """
 START = """# Job file
 
-A job file is TOML: `robotid identify job.toml`. Only `urdf` and one `[[identification]]` are needed; every other key has
-the default below. A misspelt key is an error that names the nearest right one. Paths are relative to the job file, and
-`$NAME` in them is filled in from the environment. This page is written by `python docs/write_reference.py` from the settings
-in the code, and so are those on [logs and signals](job_signals.md) and on
-[estimators and controllers](job_estimators.md); `result.json` holds the same keys under `settings`. `robotid schema > job.schema.json` writes them as a JSON
-schema: with `#:schema job.schema.json` in its first line, editors that know TOML complete and check a job file. Shells complete commands and flags after
-`eval "$(register-python-argcomplete robotid)"`.
+A job file is TOML: `robotid identify job.toml`. Only `urdf` and one `[[identification]]` are needed. A misspelt key is an error that names the nearest right one. Paths are relative to the job
+file, and `$NAME` in a path is an environment variable. `result.json` has the same keys under `settings`.
+
+Two more pages have the keys for [logs and signals](job_signals.md) and for [estimators and controllers](job_estimators.md). `python docs/write_reference.py` writes these pages from the
+settings in the code. `robotid schema > job.schema.json` writes a JSON schema: with `#:schema job.schema.json` in the first line, editors complete and check a job file.
 
 <!-- example -->
 ```toml
@@ -103,15 +103,83 @@ PAGES = dict.fromkeys(
     ("signals", "log", "units", "torque", "base", "transmission"), "job_signals.md"
 ) | dict.fromkeys(("estimator", "estimator.constraints", "controller"), "job_estimators.md")
 
+#: Ranges of numbers as the tables have them.
+SHORTER = {
+    "1e-9 to 1e12: a number, or a table of numbers by joint": "> 0, also by joint",
+    "0 to 1e12: a number, or a table of numbers by joint": "≥ 0, also by joint",
+    ": a number, or a table of numbers by joint": ", also by joint",
+    "0 or a positive number": "≥ 0",
+    "a positive number": "> 0",
+    "a positive, finite number": "> 0",
+}
+
 LOGS = """# Job file: logs and signals
 
-The tables of a [job file](job_file.md) on the content of a log: columns, units, motors, floating base, and the signal processing.
-This page is written by `python docs/write_reference.py` from the settings in the code.
+Tables of a [job file](job_file.md) for columns, units, motors, floating base, and signal processing.
 """
 ESTIMATION = """# Job file: estimators
 
-The tables of a [job file](job_file.md) that choose the estimator, its constraints, and the controller of closed-loop identification.
-This page is written by `python docs/write_reference.py` from the settings in the code.
+Tables of a [job file](job_file.md) for the [estimator](../explanation/estimators.md), its constraints, and the controller of [closed-loop identification](closed_loop.md).
+"""
+#: Parts that are added to a sentence about the residual where there is more to report.
+OPTIONAL = {
+    "also",
+    "asked",
+    "bits_of",
+    "change",
+    "conclusion",
+    "confirmed",
+    "explained",
+    "locked",
+    "percent",
+    "widened",
+}
+#: The pages of findings, by the key in the catalogue: title, and what the reader must know first.
+FINDINGS = {
+    "refused": ("Refused logs", """These errors cannot be ignored, and no result is written. The message in the terminal also names the place and the values."""),
+    "logs": ("Logs: time stamps, motion, sensors", "These findings need no model of the robot."),
+    "bases": ("Logs: floating bases, contacts, loops", """See [legged robots](../../how_to/legged.md) and [closed chains](../../how_to/closed_chains.md)."""),
+    "torques": ("Logs: torques and the URDF", """Before the identification, each log is fitted with masses of 0 or more, friction and motor inertia. "Unexplained" is the share of the
+torque's variance that this fit leaves. The best of several explanations is reported. A validation error below 5 % turns findings on masses, gravity and unexplained torque into
+notes. A known payload determines [unknown gains](../../how_to/drive_gains.md)."""),
+    "commands": ("Logs: commands and positions", """These findings describe the loop between the commanded and the measured position of each joint
+([servo arm](../../tutorials/servo_arm.md))."""),
+    "urdf": ("URDF", """`robotid inspect robot.urdf` reports these findings. `com_outside`, `density`, `gyration` and `ellipsoid` are reported for identified bodies,
+too."""),
+    "result": ("Result", "These findings describe the identified parameters."),
+    "residual": ("Residual of the fit", """Each candidate is fitted beside all base parameters, and counts by the share of the squared residual that it explains on held-out segments. A
+missing drive term (`friction_shape` to `drift`) is a warning if it explains 25 %, is 2 % of the torque, and validation logs confirm it. Its message names the setting that adds
+it: `friction`, `[drives]` or `[[coupling]]` ([friction](../../explanation/friction.md)). `position_offset` and `gravity` ([torques](torques.md)) are also reported here."""),
+    "closed_loop": ("Result of closed-loop identification", """These findings describe a fit with `[estimator] name = "simulation"`
+([closed-loop identification](../closed_loop.md))."""),
+    "prediction": ("Validation logs", """These findings describe whether the validation logs test a new motion of the same robot
+([verdict](../../explanation/verdict.md))."""),
+}  # fmt: skip
+FINDINGS_INDEX = """# Findings
+
+A finding is a statement about a log, a URDF or a result. It has a code, a severity, a place (log, joint, link), a message with the remedy, and figures. No
+finding changes data. An example, as `robotid doctor` prints it:
+
+```text
+warning: clipped: first.csv: the torque of elbow_joint is at its limit -20 in
+  31.6 % of the rows while the robot moves: it is clipped, and these rows are
+  wrong; record a slower motion, or remove these rows
+```
+
+| severity | meaning |
+|---|---|
+| error | The result would be wrong. The verdict is *poor*, and no URDF is written. |
+| warning | The result may be wrong. Many warnings limit the verdict to *usable*. |
+| note | A fact. No action is needed unless the note names one. |
+
+The tables state the typical severity; it depends on the figures and on the use of a channel. Words in italics are figures and names, which `--json` prints, too.
+
+- `robotid inspect` reports errors of a URDF. In `robotid identify` they are warnings, and the nearest possible body is used.
+- `robotid doctor --verbose` adds the notes. `result.json` has the findings of a result under [`warnings`](../result_files.md).
+- If you know that a finding is wrong, `ignore = ["urdf_mismatch"]` under `[doctor]` (`--ignore CODE`) removes its effect on the verdict. Only errors and warnings that
+  limit the verdict can be ignored.
+
+This page and the tables are written by `python docs/write_reference.py` from `robotid/diagnosis/catalogue.toml`.
 """
 
 
@@ -127,7 +195,52 @@ def pages():
     for section in sections:
         table = section.partition("]")[0].strip("`[")
         texts[PAGES.get(table, "job_file.md")].append(section)
-    return {name: "\n## ".join(parts).rstrip() + "\n" for name, parts in texts.items()}
+    written = {name: "\n## ".join(parts).rstrip() + "\n" for name, parts in texts.items()}
+    return written | findings()
+
+
+def findings():
+    """Return the texts of the pages on findings, by file name: an index, and a table for each group."""
+    index, texts = [FINDINGS_INDEX], {}
+    for page, (title, words) in FINDINGS.items():
+        found = {c: e for c, e in entries().items() if e["page"] == page and ":" not in c}
+        index.append(f"## {title}\n\n{', '.join(f'[`{c}`]({page}.md#{c})' for c in found)}\n")
+        rows = [finding_row(code, entry) for code, entry in found.items()]
+        head = "| code | message | cause | remedy |\n|---|---|---|---|"
+        texts[f"findings/{page}.md"] = "\n".join([f"# {title}\n", f"{words}\n", head, *rows]) + "\n"
+    return {"findings/index.md": "\n".join(index), **texts}
+
+
+def finding_row(code, entry):
+    """Return the line of a finding; what follows a colon in its message is the cause if none is stated."""
+    subject, message, cause = re.fullmatch(
+        r"((?:link )?\*\w+\*: )?(.*?)(?:: (.*))?", plain(entry, "message")
+    ).groups("")
+    if "*" in cause and "cause" not in entry:
+        cause, message = "", f"{message}: {cause}"
+    about = entry.get("term") or entry.get("about") or subject + message
+    cells = (about, "" if "term" in entry else entry.get("cause", cause), plain(entry, "remedy"))
+    shown = " | ".join(x if x[1:2].isupper() else x[:1].lower() + x[1:] for x in cells)
+    return f"| `{code}`{{#{code}}} {entry['severity']} | {shown.replace('<', '&lt;')} |"
+
+
+def plain(entry, part):
+    """Return the first sentence of a template, its last choice, names of slots in italics."""
+    text = entry.get(part, "")
+    for _ in range(3):  # parts may contain others
+        for name, parts in entry.items():
+            if isinstance(parts, dict):
+                chosen = [x for x in parts.values() if x != "; no action needed"]
+                text = text.replace(f"{{{name}}}", "" if name in OPTIONAL else chosen[-1])
+    shown = ""
+    for literal, name, spec, _ in Formatter().parse(text.strip(" ;.:,")):
+        unit = next((x for x in (" %", " ms") if spec and spec.rstrip("~").endswith(x)), "")
+        shown += literal
+        if name and name not in OPTIONAL:
+            shown += f"*{name.replace('_', ' ')}*{unit}"
+    shown = re.sub(r" \+- \*[\w ]+\*( ms)?| \([^()]*\*[^()]*\)", "", shown)  # errors, asides
+    first = re.sub(r"^(: |\. |\*cure\*|This explains [^.]*\.? ?|no action needed)+", "", shown)
+    return first.split(". ")[0].strip(" ;.:,")
 
 
 def job_file():
@@ -160,7 +273,7 @@ def job_file():
         parts += [f"\n## `{title}`\n", f"{about.strip()}\n"]
         parts += listing([row(key.at or field.name, field, key) for field, key in keys(kind)])
         if name == "signals":
-            words = "What is identified, and with which drive terms ([their names](symbols.md#names-of-parameters)).\n"
+            words = "What is identified, with which drive terms ([names](symbols.md#names-of-parameters)).\n"
             parts += ["\n## `[model]`\n", words, *drive_terms(tables.pop("model"))]
         if name == "units":
             for other, rows in tables.items():
@@ -196,7 +309,7 @@ def estimators():
     for name, kind in ESTIMATORS.items():
         default = ", the default" if name == "consistent" else ""
         yield f"| `{name}`{default} | {kind.paths()['name'].text} |"
-    yield "\nEach has settings of its own; one of another estimator is refused.\n"
+    yield "\nA setting of another estimator is an error.\n"
     yield "| key | default | of | meaning |\n|---|---|---|---|"
     said = {}
     for name, kind in ESTIMATORS.items():
@@ -231,7 +344,10 @@ def row(name, field, key):
 def meaning(key):
     """Return what a key is, and the range of its numbers."""
     words = (key.words[:1].upper() + key.words[1:]).replace("<dynamics>", "`<dynamics>`")
-    return words if key.within is None else f"{words} ({key.within.words})"
+    within = "" if key.within is None else key.within.words
+    for long, short in SHORTER.items():
+        within = within.replace(long, short)
+    return f"{words} ({within})" if within else words
 
 
 def default_of(field):
@@ -240,7 +356,7 @@ def default_of(field):
         return "required"
     value = field.default_factory() if field.default is MISSING else field.default
     if value is None:
-        return "not stated"
+        return "-"
     if isinstance(value, float) and not math.isclose(value, round(value, 6), rel_tol=1e-12):
         return f"`{value!r}`"
     words = {True: "true", False: "false"} if isinstance(value, bool) else {}

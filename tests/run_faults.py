@@ -72,7 +72,7 @@ def misfit(entry: dict[str, str | list[str]]) -> str | None:
     count = path.read_text().count(entry["text"]) if path.is_file() else 0
     absent = [test for test in entry["tests"] if not (ROOT / test.split("::")[0]).exists()]
     if count != 1:
-        return f"{entry['file']}: the text occurs {count} times, wanted once: {entry['text']!r}"
+        return f"{entry['file']}: the text occurs {count} times, expected once: {entry['text']!r}"
     return f"{entry['file']}: there is no {absent[0]}" if absent else None
 
 

@@ -72,7 +72,7 @@ def test_files_of_a_folder_replace_those_of_their_names(tmp_path):
 def test_a_folder_in_the_place_of_a_file_is_refused_and_nothing_is_mixed(tmp_path):
     write_text("old", tmp_path / "a")
     (tmp_path / "b").mkdir()
-    message = r"b' is a folder, wanted a file to write; remove it, or name another"
+    message = r"b' is a folder, expected a file; remove it, or name another"
     with pytest.raises(SettingsError, match=message):
         replace(tmp_path, "a", "b")
     assert (tmp_path / "a").read_text() == "old"
@@ -115,7 +115,7 @@ def test_folders_that_are_not_writable_are_refused(tmp_path, monkeypatch):
 
 def test_places_where_nothing_can_be_written_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(SettingsError, match="file' is a file, wanted a folder for the results"):
+    with pytest.raises(SettingsError, match="file' is a file, expected a folder for the results"):
         check_folder(tmp_path / "file" / "below")
     check_folder(tmp_path / "not" / "yet", ["result.json"])
     with pytest.raises(DataError, match=r"the folder '.*not' of x does not exist"):
@@ -178,7 +178,7 @@ def test_a_file_whose_name_is_as_long_as_can_be_is_written(tmp_path, name):
 
 
 def test_a_name_that_no_file_system_takes_is_refused_before_the_work(tmp_path):
-    words = "has 256 bytes, wanted at most 255; shorten it"
+    words = "has 256 bytes, expected at most 255; shorten it"
     for refuse in (
         lambda: check_file(tmp_path / ("x" * 256)),
         lambda: check_file(tmp_path / ("é" * 128)),
@@ -191,7 +191,7 @@ def test_a_name_that_no_file_system_takes_is_refused_before_the_work(tmp_path):
 
 def test_what_has_no_end_has_no_hash(tmp_path):
     (tmp_path / "log.csv").symlink_to("/dev/null")
-    with pytest.raises(DataError, match=r"log.csv' is a pipe or a device, wanted a file; copy it"):
+    with pytest.raises(DataError, match=r"log.csv' is a pipe or a device, expected a file; copy"):
         file_sha256(tmp_path / "log.csv")
 
 

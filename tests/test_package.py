@@ -131,13 +131,21 @@ def test_the_command_line_quick_start_runs(folder, capsys):
     assert main(["validate", "result/result.json", "second.csv"]) == 0
 
 
-@pytest.mark.parametrize("recipe", ["gripper", "currents", "coupled"])
-def test_the_recipes_are_job_files(folder, recipe):
-    job = job_from_settings(tomllib.loads(block(f"job: {recipe}")), "README.md", folder)
-    assert job.identification
-    assert bool(job.locked) == (recipe == "gripper")
-    assert bool(job.gains) == (recipe == "currents")
-    assert bool(job.couplings) == (recipe == "coupled")
+def test_the_recipe_is_a_job_file_for_gripper_currents_and_coupling(folder):
+    job = job_from_settings(tomllib.loads(block("job: arm")), "README.md", folder)
+    parts = (job.identification, job.validation, job.locked, job.gains, job.couplings)
+    assert all(parts)
+
+
+def test_the_equations_of_the_paper_agree_with_pinocchio(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    names = {}
+    exec(compile(block("python paper"), "README.md", "exec"), names)
+    torque = names["Y"] @ names["pi"]
+    assert (abs(torque) > 1.0).all()
+    P = names["parameters"](names["PAPER_LINKS"])
+    equations = names["regressor"](names["q"], names["v"], names["a"]) @ P
+    np.testing.assert_allclose(equations, torque, rtol=1e-12)
 
 
 def test_its_commands_are_those_of_ci_and_fit_one_line():

@@ -59,15 +59,15 @@ def test_a_masked_value_is_no_value(log):
 @pytest.mark.parametrize(
     ("other", "words"),
     [
-        ({"tau": None}, "tau is None, wanted an array; without torques, pass zeros and has_torque"),
-        ({"q": None}, "q is None, wanted an array"),
+        ({"tau": None}, "tau is None, expected an array; without torques, pass zeros and"),
+        ({"q": None}, "q is None, expected an array"),
         ({"q": "x"}, "q is not an array of real numbers"),
-        ({"q": [[1.0, 2.0], [3.0]]}, "wanted an array of floats with rows of equal length"),
+        ({"q": [[1.0, 2.0], [3.0]]}, "expected an array of floats with rows of equal length"),
         ({"q": np.full((60, 2), 1j)}, "q is not an array of real numbers .numbers of kind 'c'"),
-        ({"joints": 5}, "joints is 5, wanted at least one name in a tuple"),
+        ({"joints": 5}, "joints is 5, expected at least one name in a tuple"),
         ({"t": 10**400}, "t is not an array of real numbers"),
-        ({"joints": (1, 2)}, "wanted at least one name in a tuple"),
-        ({"joints": {"joint_1": 0, "joint_2": 1}}, "wanted at least one name in a tuple"),
+        ({"joints": (1, 2)}, "expected at least one name in a tuple"),
+        ({"joints": {"joint_1": 0, "joint_2": 1}}, "expected at least one name in a tuple"),
     ],
 )
 def test_what_is_no_log_is_refused(log, other, words):
@@ -145,7 +145,7 @@ CALLS = {
 @pytest.mark.parametrize("name", CALLS)
 def test_an_argument_of_another_kind_is_named(model, log, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SettingsError, match=rf"^{re.escape(name.strip())} is .*, wanted "):
+    with pytest.raises(SettingsError, match=rf"^{re.escape(name.strip())} is .*, expected "):
         CALLS[name](model, log)
     assert not list(Path(tmp_path).iterdir())
 
@@ -153,13 +153,13 @@ def test_an_argument_of_another_kind_is_named(model, log, tmp_path, monkeypatch,
 @pytest.mark.parametrize("value", [b"x", np.zeros(3), object()])
 @pytest.mark.parametrize("name", ["cutoff", "order", "trim", "velocity", "torque_delay"])
 def test_settings_of_any_kind_are_refused_in_words(name, value):
-    with pytest.raises(RobotIdError, match=rf"^{name} is .*, wanted"):
+    with pytest.raises(RobotIdError, match=rf"^{name} is .*, expected"):
         SignalSettings(**{name: value})
 
 
 def test_a_payload_needs_logs_with_and_without_it(model, log):
     for name, logs in (("logs", ([], log)), ("reference", (log, []))):
-        with pytest.raises(DataError, match=rf"^{name} has no log, wanted at least one"):
+        with pytest.raises(DataError, match=rf"^{name} has no log, expected at least one"):
             payload(model, *logs)
 
 
@@ -172,16 +172,16 @@ CALLS_OF_A_RESULT = {
     "q is not an array of real numbers": lambda found, q: found.predict("x"),
     "v is not an array of real numbers": lambda found, q: found.predict(q, 1j * q),
     "a is not an array of real numbers": lambda found, q: found.predict(q, q, 10**400),
-    "joint is 5, a int, wanted the name of a joint": lambda found, q: found.friction(5),
+    "joint is 5 (int), expected the name of a joint": lambda found, q: found.friction(5),
     "v is not an array of real": lambda found, q: found.friction("joint_1", "x"),
-    "v has shape (3, 2), wanted finite speeds": lambda found, q: found.friction("joint_1", q),
-    "q is 'x', wanted a finite number": lambda found, q: found.friction("joint_1", q="x"),
-    "load is 'nan', wanted a finite": lambda found, q: found.friction("joint_1", load=np.nan),
-    "joint is None, a NoneType, wanted the name": lambda found, q: pictures.plot_why(found, None),
-    "recording is 5, a int, wanted": lambda found, q: pictures.plot_torques(
+    "v has shape (3, 2), expected finite speeds": lambda found, q: found.friction("joint_1", q),
+    "q is 'x', expected a finite number": lambda found, q: found.friction("joint_1", q="x"),
+    "load is 'nan', expected a finite": lambda found, q: found.friction("joint_1", load=np.nan),
+    "joint is None (NoneType), expected the name": lambda found, q: pictures.plot_why(found, None),
+    "recording is 5 (int), expected": lambda found, q: pictures.plot_torques(
         found, "joint_1", recording=5
     ),
-    "name is ['wls'], wanted 'estimate' or 'wls'": lambda found, q: found.metrics(["wls"]),
+    "name is ['wls'], expected 'estimate' or 'wls'": lambda found, q: found.metrics(["wls"]),
     "'a\\x00b' is not a valid path": lambda found, q: robotid.save_result(found, "a\0b"),
     "'\\ud800' is not a valid path": lambda found, q: write_report(found, "\ud800"),
 }
@@ -215,7 +215,7 @@ def test_a_path_that_no_file_system_takes_is_refused(model, log, path):
         lambda: read_job(path),
         lambda: robotid.write_log(log, f"{path}.csv"),
     ):
-        with pytest.raises(SettingsError, match=r"is not a valid path|a file has .* bytes, wanted"):
+        with pytest.raises(SettingsError, match=r"not a valid path|a file has .* bytes, expected"):
             call()
 
 
@@ -223,9 +223,9 @@ def test_a_path_that_no_file_system_takes_is_refused(model, log, path):
     ("t", "q", "tau", "words"),
     [
         ("x", [0, 0], [0, 0], "t = x s is not finite"),
-        (0.0, None, [0, 0], "q is None, wanted an array"),
-        (0.0, [0, 0, 0], [0], r"q, tau have shapes \(3,\), \(1,\), wanted \(2,\) each"),
-        (0.0, [0, 0], [0, 0, 0], r"q, tau have shapes \(2,\), \(3,\), wanted \(2,\) each"),
+        (0.0, None, [0, 0], "q is None, expected an array"),
+        (0.0, [0, 0, 0], [0], r"q, tau have shapes \(3,\), \(1,\), expected \(2,\) each"),
+        (0.0, [0, 0], [0, 0, 0], r"q, tau have shapes \(2,\), \(3,\), expected \(2,\) each"),
         (0.0, [0, 0], ["x", 0], "tau is not an array of real numbers"),
     ],
 )
@@ -239,32 +239,32 @@ def test_a_sample_that_is_none_changes_nothing(model, t, q, tau, words):
 REFUSED = {
     "start is ": lambda m, log: log.window(log.q, 1.0),
     "end is ": lambda m, log: log.window(0.0, 10**400),
-    "constraints has the key 'weight', wanted keys": lambda m, log: robotid.EstimatorSettings(
+    "constraints has the key 'weight', expected keys": lambda m, log: robotid.EstimatorSettings(
         constraints={"weight": 1.0}
     ),
     "joint 'joint_2' is locked at": lambda m, log: RobotModel.from_urdf(
         URDF, locked={"joint_2": "x"}
     ),
-    "ratios of 'c' has ('joint_2', 'x'), wanted pairs": lambda m, log: Coupling(
+    "ratios of 'c' has ('joint_2', 'x'), expected pairs": lambda m, log: Coupling(
         "c", (("joint_1", 1.0), ("joint_2", "x"))
     ),
-    "the mass of the payload on link_2 is 'x' kg, wanted": lambda m, log: payload(
+    "the mass of the payload on link_2 is 'x' kg, expected": lambda m, log: payload(
         m, log, log, masses={"link_2": "x"}
     ),
-    "masses of 'x' have shape (3,), wanted 20 or 28 finite": lambda m, log: robotid.replay(
+    "masses of 'x' have shape (3,), expected 20 or 28 finite": lambda m, log: robotid.replay(
         m, log.t, log.q, masses={"y": m.standard_parameters(), "x": np.zeros(3)}
     ),
-    "ghost 'x' has 3 arrays, wanted two": lambda m, log: robotid.replay(
+    "ghost 'x' has 3 arrays, expected two": lambda m, log: robotid.replay(
         m, log.t, log.q, ghosts={"x": (log.t, log.q, log.q)}
     ),
-    "log: joints.joint_2 is 5, wanted a name": lambda m, log: LogSource(
+    "log: joints.joint_2 is 5, expected a name": lambda m, log: LogSource(
         joints={"joint_1": "a", "joint_2": 5}
     ),
     "gravity is ": lambda m, log: RobotModel.from_urdf(URDF, gravity=(0, 0, 10**400)),
-    "trajectory: rate is 'x', wanted": lambda m, log: robotid.Trajectory(
+    "trajectory: rate is 'x', expected": lambda m, log: robotid.Trajectory(
         log.t, log.q, log.q, log.q, log.tau, log.joints, "x", np.zeros(60, dtype=int)
     ),
-    "trajectory: segment is object of shape (), wanted": lambda m, log: robotid.Trajectory(
+    "trajectory: segment is object of shape (), expected": lambda m, log: robotid.Trajectory(
         log.t, log.q, log.q, log.q, log.tau, log.joints, None, [[1], [1, 2]]
     ),
 }
@@ -278,7 +278,7 @@ def test_an_entry_of_another_kind_is_named(model, log, words):
 
 def test_a_gain_that_is_no_number_is_refused(log, tmp_path):
     robotid.write_log(log, tmp_path / "log.csv")
-    words = "gain of 'joint_2' is .*, wanted a number other than"
+    words = "gain of 'joint_2' is .*, expected a number other than"
     for gain in (None, "x", np.nan, 0):
         gains = {"joint_1": 2.0, "joint_2": gain}
         with pytest.raises(SettingsError, match=words):
@@ -337,7 +337,7 @@ def test_each_public_boundary_names_the_argument_and_its_type(
 
 def test_a_result_from_torques_has_no_controller(result, log):
     assert result.rate is None
-    with pytest.raises(DataError, match=r"result.json is a result from torques, wanted one of"):
+    with pytest.raises(DataError, match=r"result.json is a result from torques, expected one of"):
         result.open_loop(log)
 
 

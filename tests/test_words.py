@@ -2,14 +2,10 @@
 
 import ast
 import re
-import sys
 from functools import cache
 
 import pytest
 from helpers.paths import DOCS, ROOT
-
-sys.path.append(str(ROOT / "benchmarks"))
-from write_tables import BLOCK
 
 #: What is refused, as a regular expression, and what to write in its place.
 REFUSED = {
@@ -120,8 +116,7 @@ def test_the_package_uses_the_words_of_the_field(part, kind):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_pages_use_the_words_of_the_field(page):
-    text = BLOCK.sub("", page.read_text())  # figures, as a benchmark printed them
-    text = re.sub(r"```.*?```|`[^`]*`", "", text, flags=re.DOTALL)
+    text = re.sub(r"```.*?```|`[^`]*`", "", page.read_text(), flags=re.DOTALL)
     found = faults(text)
     assert not found, "\n".join(found)
 

@@ -41,13 +41,13 @@ def check_path(path: str | Path) -> None:
         raw = b"\0"
     if b"\0" in raw or len(raw) > LONGEST_PATH:
         raise SettingsError(
-            f"{str(path)[:_SHOWN]!r} is not a valid path, wanted UTF-8 without NUL, at most "
+            f"{str(path)[:_SHOWN]!r} is not a valid path, expected UTF-8 without NUL, at most "
             f"{LONGEST_PATH} bytes"
         )
     name = max(raw.split(os.fsencode(os.sep)), key=len)
     if len(name) > _LONGEST:
         raise SettingsError(
-            f"the name '{os.fsdecode(name)[:_SHOWN]}...' of a file has {len(name)} bytes, wanted "
+            f"the name '{os.fsdecode(name)[:_SHOWN]}...' of a file has {len(name)} bytes, expected "
             f"at most {_LONGEST}; shorten it (names of results start with that of the URDF)"
         )
 
@@ -61,7 +61,7 @@ def check_file(target: Path, inputs: Iterable[str | Path | None] = ()) -> None:
         )
     if target.is_dir():
         raise SettingsError(
-            f"{str(target)!r} is a folder, wanted a file to write; remove it, or name another file"
+            f"{str(target)!r} is a folder, expected a file; remove it, or name another file"
         )
     if _is_stream(target):
         return
@@ -88,7 +88,7 @@ def check_folder(
     existing = next(folder for folder in (target, *target.absolute().parents) if folder.exists())
     if not existing.is_dir():
         raise SettingsError(
-            f"{str(existing)!r} is a file, wanted a folder for the results; name another folder"
+            f"{str(existing)!r} is a file, expected a folder for the results; name another folder"
         )
     _require_writable(existing)
     for name in names:
@@ -220,9 +220,9 @@ def finite(value: float) -> float | None:
 def missing_file(path: Path, what: str) -> str:
     """Return the message for a path that is not a regular file."""
     if path.is_dir():
-        return f"{str(path)!r} is a folder, wanted a {what}"
+        return f"{str(path)!r} is a folder, expected a {what}"
     if path.exists():
-        return f"{str(path)!r} is a pipe or a device, wanted a {what}; copy it to a file"
+        return f"{str(path)!r} is a pipe or a device, expected a {what}; copy it to a file"
     return f"there is no {what} {str(path)!r}{_similar_file(path)}"
 
 
@@ -249,7 +249,7 @@ def read_json(path: str | Path, what: str) -> Any:  # noqa: ANN401
         json.dumps(content, allow_nan=False, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
         raise DataError(
-            f"{source.name} is not JSON: {str(error)[:200]}; wanted a {what}"
+            f"{source.name} is not JSON: {str(error)[:200]}; expected a {what}"
         ) from error
     inside = [content]
     for _ in range(DEEPEST):

@@ -31,7 +31,7 @@ class Entries:
 def require_kind(value: object, kind: type | tuple[type, ...], name: str, wanted: str) -> None:
     """Refuse an argument of the wrong type."""
     if not isinstance(value, kind):
-        raise SettingsError(f"{name} is {shown(value)}, a {type(value).__name__}, wanted {wanted}")
+        raise SettingsError(f"{name} is {shown(value)} ({type(value).__name__}), expected {wanted}")
 
 
 def require_each(
@@ -188,7 +188,7 @@ def check_keys(
         wanted = schema[key]
         if isinstance(wanted, dict):
             if not isinstance(value, Mapping):
-                raise SettingsError(f"{at} is {shown(value)}, wanted a table [{section}{key}]")
+                raise SettingsError(f"{at} is {shown(value)}, expected a table [{section}{key}]")
             check_keys(value, wanted, where, f"{section}{key}.")
         elif isinstance(wanted, list):
             _check_array(value, wanted[0], where, f"{section}{key}")
@@ -201,7 +201,7 @@ def check_keys(
 def _check_array(value: object, schema: Mapping[str, Any], where: str, name: str) -> None:
     if not isinstance(value, list) or not all(isinstance(item, Mapping) for item in value):
         raise SettingsError(
-            f"{where}: {name} is {shown(value)}, wanted tables written as [[{name}]]"
+            f"{where}: {name} is {shown(value)}, expected tables written as [[{name}]]"
         )
     for item in value:
         check_keys(item, schema, where, f"{name}.")
@@ -213,23 +213,23 @@ def _check_array(value: object, schema: Mapping[str, Any], where: str, name: str
 def _check_entries(value: object, wanted: Entries, at: str) -> None:
     if wanted.count is not None and not isinstance(value, wanted.outer):
         kind = "numbers" if float in wanted.inner else "entries"
-        raise SettingsError(f"{at} is {shown(value)}, wanted a list of {wanted.count} {kind}")
+        raise SettingsError(f"{at} is {shown(value)}, expected a list of {wanted.count} {kind}")
     _check_type(value, (wanted.outer,), at)
     if isinstance(value, Mapping):
         for name, entry in value.items():
             _check_type(entry, wanted.inner, f"{at}.{name}")
     elif isinstance(value, list):
         if wanted.count is not None and len(value) != wanted.count:
-            raise SettingsError(f"{at} has {len(value)} entries, wanted {wanted.count}")
+            raise SettingsError(f"{at} has {len(value)} entries, expected {wanted.count}")
         for k, entry in enumerate(value):
             _check_type(entry, wanted.inner, f"{at}[{k}]")
 
 
 def _check_type(value: object, kinds: tuple[type, ...], at: str) -> None:
     if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
-        raise SettingsError(f"{at} is {shown(value)}, wanted {_type_name(kinds)}")
+        raise SettingsError(f"{at} is {shown(value)}, expected {_type_name(kinds)}")
     if isinstance(value, int | float) and not abs(value) <= LARGEST_SETTING:  # NaN, too
-        raise SettingsError(f"{at} is {shown(value)}, wanted a number between -1e30 and 1e30")
+        raise SettingsError(f"{at} is {shown(value)}, expected a number between -1e30 and 1e30")
 
 
 def shown(value: object) -> str:
@@ -252,7 +252,7 @@ def _check_value(value: Any, key: Key, name: str) -> None:  # noqa: ANN401
     except (TypeError, ValueError):  # of a value for which the check is not made
         is_number = False
     if not (is_number or (is_word and value in key.among)):
-        raise SettingsError(f"{name} is {shown(value)}, wanted {' or '.join(words)}")
+        raise SettingsError(f"{name} is {shown(value)}, expected {' or '.join(words)}")
 
 
 _NUMBER = (int, float)

@@ -31,7 +31,7 @@ def report_stage(
 def real_numbers(values: ArrayLike | None, name: str, *, hint: str = "") -> Array:
     """Return values as a read-only array of numbers; NaN where a masked array is masked."""
     if values is None:
-        raise DataError(f"{name} is None, wanted an array{hint}")
+        raise DataError(f"{name} is None, expected an array{hint}")
     try:
         array: Array = np.ma.asanyarray(values)
         if array.dtype.kind not in "biufO":
@@ -41,7 +41,7 @@ def real_numbers(values: ArrayLike | None, name: str, *, hint: str = "") -> Arra
         return frozen(values)
     except (TypeError, ValueError, OverflowError) as error:
         raise DataError(
-            f"{name} is not an array of real numbers ({str(error)[:100]}); wanted an array of "
+            f"{name} is not an array of real numbers ({str(error)[:100]}); expected an array of "
             "floats with rows of equal length"
         ) from error
 

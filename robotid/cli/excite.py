@@ -94,7 +94,7 @@ def _designer(
     name = settings.criterion or ("D" if run is None else "widest")
     if name == "widest" and run is None:
         words = "criterion is widest, which needs an earlier result"
-        raise SettingsError(f"{words}: wanted --given RESULT, or another criterion")
+        raise SettingsError(f"{words}: expected --given RESULT, or another criterion")
     model.require_fixed("motion design")
     limits = MotionLimits.of_model(
         model, share=settings.share, velocity=settings.velocity, torque=settings.torque,
@@ -127,7 +127,7 @@ def _check_jerk(course: Course, joints: Sequence[str]) -> None:
     if used[joint] > 1.0:
         raise SettingsError(
             f"{joints[joint]} needs {100 * used[joint]:.0f} % of its jerk limit at "
-            f"{course.peak('jerk', joint):.2f} s, wanted at most 100 %: the design of a motion "
+            f"{course.peak('jerk', joint):.2f} s, expected at most 100 %: the design of a motion "
             "between poses ignores jerk limits. Increase --max-jerk or reduce --share"
         )
 
@@ -223,7 +223,7 @@ def _boxes(words: Sequence[str], flag: str) -> tuple[Box, ...]:
         wanted += f"within {FARTHEST:g} m"
         x = [number(text, flag, wanted, repr(word)) for text in corners.split(",")]
         if len(x) != 6 or not all(abs(place) <= FARTHEST for place in x):
-            raise SettingsError(f"{flag} {word!r}: wanted {wanted}")
+            raise SettingsError(f"{flag} {word!r}: expected {wanted}")
         boxes.append(Box(name, (x[0], x[1], x[2]), (x[3], x[4], x[5])))
     return tuple(boxes)
 

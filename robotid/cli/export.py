@@ -42,7 +42,7 @@ def export(
         SettingsError: If the format, an option or the target is not usable.
     """
     if format not in formats():
-        raise SettingsError(f"format is {format!r}, wanted one of {listed(formats())}")
+        raise SettingsError(f"format is {format!r}, expected one of {listed(formats())}")
     stated = {name: value for name, value in options.items() if value is not None}
     having = options_of(formats())
     for name in stated:

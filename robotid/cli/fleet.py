@@ -83,7 +83,7 @@ class FleetUnit(Workload):
         job = Job(Path()) if self.job is None else read_job(self.job)
         if isinstance(job.estimator, SimulationSettings):
             raise SettingsError(
-                "the estimator is 'simulation', wanted one of torques, as 'consistent'; identify "
+                "the estimator is 'simulation', expected one of torques, as 'consistent'; identify "
                 "robots from commands with robotid identify"
             )
         fitted = tuple(LogEntry(path) for path, mass in self.logs if mass is None)
@@ -116,12 +116,12 @@ def read_fleet(
                 "read: " + ", ".join(COLUMNS)
             )
     if not rows:
-        raise DataError(f"{source.name} has no rows, wanted one for each log")
+        raise DataError(f"{source.name} has no rows, expected one for each log")
     for number, cells in enumerate(rows, start=1):
         row = _Row(source, number, cells)
         for name in ("unit", "log"):
             if not cells[name]:
-                words = f"no value, wanted the {COLUMNS[name]}; fill it in, or remove the row"
+                words = f"no value, expected the {COLUMNS[name]}; fill it in, or remove the row"
                 raise row.error(name, words)
         by_unit[cells["unit"]].append(row)
     return [_unit(name, of_unit, urdf, job) for name, of_unit in by_unit.items()]
@@ -156,7 +156,7 @@ class _Row:
         except ValueError:
             mass = float("nan")
         if not 0.0 <= mass < 1e6:
-            raise self.error("payload", f"{text!r}, wanted a mass in kg, 0 or empty for none")
+            raise self.error("payload", f"{text!r}, expected a mass in kg, 0 or empty for none")
         return mass or None
 
 

@@ -144,7 +144,7 @@ def identify(
     is_simulated = isinstance(choice, SimulationSettings)
     if controller is not None and not is_simulated:
         raise SettingsError(
-            f"controller is given, but the estimator is {choice.name!r}, wanted 'simulation'; "
+            f"controller is given, but the estimator is {choice.name!r}, expected 'simulation'; "
             "remove controller, or set estimator='simulation'"
         )
     require_kind(controller, (Mapping, type(None)), "controller", "a table of its settings")
@@ -155,7 +155,7 @@ def identify(
     if is_simulated and (any(wanted) or len({names is None for names in wanted}) > 1):
         raise SettingsError(
             "friction is stated by joint or with families, but simulation selects the terms of all "
-            "joints, or of none; wanted 'auto' or 'viscous+coulomb'. State terms in the model"
+            "joints, or of none; expected 'auto' or 'viscous+coulomb'. State terms in the model"
         )
     needs = needed_of(loop) if is_simulated else "torque"
     fitted, held_out = (logs_of(model, some, needs) for some in (logs, validation))
@@ -334,7 +334,7 @@ def identify_job(
     fitted, validation = survey_logs(job, model, *groups, refuse=refuse)
     if not fitted:
         which = "no log is usable" if job.identification else "no log is given"
-        raise DataError(f"{which}, wanted at least one to identify from")
+        raise DataError(f"{which}, expected at least one to identify from")
     report_stage(plan.progress, "checking logs")
     job, model, fitted, validation, notes = locked_as_logged(job, model, fitted, validation)
     locked = locked_findings(model, job.placed(model))

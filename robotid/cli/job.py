@@ -69,7 +69,7 @@ def _load_terms(table: Mapping[str, Any]) -> tuple[str, ...]:
         for name in names:
             if name not in known:
                 raise SettingsError(
-                    f"friction is {friction!r}, wanted auto, none, or some of {listed(known)}, "
+                    f"friction is {friction!r}, expected auto, none, or some of {listed(known)}, "
                     "separated by +"
                 )
     switched = [name for name in TERMS if name not in _PLAIN and table.get(name, True)]
@@ -95,7 +95,7 @@ def _load_term(joint: str, entry: Any) -> str | DriveTerm:  # noqa: ANN401
             raise SettingsError(f"drives.{joint}: {error}") from error
     if entry not in FAMILIES:
         wanted = f"some of {listed(FAMILIES)}, or a table with the shape of a term"
-        raise SettingsError(f"drives.{joint} has {entry!r}, wanted {wanted}")
+        raise SettingsError(f"drives.{joint} has {entry!r}, expected {wanted}")
     return entry
 
 
@@ -251,7 +251,7 @@ class Job(Settings):
         is_looped = isinstance(self.estimator, SimulationSettings)
         if self.controller != LoopSettings() and not is_looped:
             raise SettingsError(
-                f"[controller] is stated, but the estimator is {self.estimator.name!r}, wanted "
+                f"[controller] is stated, but the estimator is {self.estimator.name!r}, expected "
                 "'simulation'; set [estimator] name = 'simulation', or remove [controller]"
             )
 
@@ -340,7 +340,7 @@ def job_file(model: object) -> Job:
     if isinstance(model, str | Path) and Path(model).suffix == ".toml":
         return read_job(model)
     wanted = "the robot and its logs, or a job file (.toml) alone"
-    raise SettingsError(f"no log is given, wanted {wanted}")
+    raise SettingsError(f"no log is given, expected {wanted}")
 
 
 def as_job(robot: Job | str | Path) -> Job:
@@ -391,7 +391,7 @@ def number(word: str, flag: str, wanted: str, shown: str = "") -> float:
     try:
         return float(word)
     except ValueError as error:
-        raise SettingsError(f"{flag} {shown or repr(word)}: wanted {wanted}") from error
+        raise SettingsError(f"{flag} {shown or repr(word)}: expected {wanted}") from error
 
 
 def pairs(words: Sequence[str], flag: str) -> dict[str, float]:
@@ -415,7 +415,7 @@ def _once(words: Sequence[str], flag: str) -> dict[str, str]:
 
 def _names(words: Sequence[str], flag: str) -> dict[str, str]:
     if wrong := [word for word in words if not all(word.partition("=")[::2])]:
-        raise SettingsError(f"{flag} {wrong[0]!r}: wanted JOINT=NAME")
+        raise SettingsError(f"{flag} {wrong[0]!r}: expected JOINT=NAME")
     return _once(words, flag)
 
 
@@ -608,7 +608,7 @@ def job_from_flags(options: argparse.Namespace) -> Job:
     if logs == []:
         kind = "motion" if hasattr(options, "given") else "log"  # of preview
         one = kind.upper()
-        raise SettingsError(f"no {kind} is given; wanted URDF {one} [{one} ...], or JOB.toml")
+        raise SettingsError(f"no {kind} is given; expected URDF {one} [{one} ...], or JOB.toml")
     table = {"urdf": options.source, "identification": [{"log": log} for log in logs]}
     table["validation"] = [{"log": log} for log in getattr(options, "validate", None) or ()]
     return job_from_settings(table | JOB.stated(options), "command line", Path())

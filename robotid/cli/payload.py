@@ -45,7 +45,7 @@ def stated_masses(words: Sequence[str], links: Sequence[str]) -> dict[str, float
         link, _, mass = word.rpartition("=")
         if not link and len(links) > 1:
             raise SettingsError(
-                f"--mass {word}: the link is ambiguous, wanted one of {listed(links)}. "
+                f"--mass {word}: the link is ambiguous, expected one of {listed(links)}. "
                 "Write --mass LINK=KG"
             )
         masses[link or links[0]] = number(mass, "--mass", "KG or LINK=KG", repr(word))
@@ -65,7 +65,7 @@ def measure_payload(
     entries = [LogEntry(Path(path)) for path in references]
     if any(map(is_result, references)):
         if len(references) > 1:
-            wanted = "wanted one result alone, or logs"
+            wanted = "expected one result alone, or logs"
             raise SettingsError(f"references are {listed(references)}, {wanted}")
         advice = "give a log without the payload: --reference LOG"
         job, entries = job_of_result(job, references[0], advice)

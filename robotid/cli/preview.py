@@ -41,7 +41,7 @@ def preview_job(
 ) -> dict[str, Any]:
     """Preview the logs of a job from their positions alone."""
     if not job.identification:
-        raise DataError("no motion is given, wanted at least one to preview")
+        raise DataError("no motion is given, expected at least one to preview")
     about: dict[str, Any] = {"noise": noise, "correlation": correlation}
     if given is None:
         model = job.model()

@@ -65,7 +65,9 @@ class Findings:
         contents = [*(result.content for result in self.results.values()), self.track]
         settings = next(content["settings"] for content in contents if content)
         job = written_job(settings, "settings of the result")
-        return replace(job, urdf=Path(urdf), identification=(LogEntry(Path(log)),), validation=())
+        parts = tuple(x for x in job.validation if x.path.name == Path(log).name)
+        fitted = (LogEntry(Path(log)),)
+        return replace(job, urdf=Path(urdf), identification=fitted, validation=parts)
 
 
 def read_findings(paths: Sequence[str | Path]) -> Findings:
@@ -89,7 +91,7 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
             label = name if name not in results else f"{name} {len(results) + 1}"
             results[label] = load_result(file)
     if len(tracks) > 1:
-        raise DataError(f"{len(tracks)} tracks are given, wanted at most one")
+        raise DataError(f"{len(tracks)} tracks are given, expected at most one")
     folder, track = tracks[0] if tracks else (Path(), None)
     return Findings(results, track, folder, beside[min(1, len(paths))])
 
@@ -99,7 +101,7 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
     model = job.model()
     (entry,) = job.identification
     if commanded := {label: x for label, x in findings.results.items() if x.commanded}:
-        return _replay_commanded(job, commanded, ghost)
+        return _replay_commanded(job, commanded, ghost, _marks(job, findings.track))
     is_motion = not job.lay_out(entry, model, needs="motion")[0].has_torque
     motion = closed_log(model, job.read(entry, model, needs="motion" if is_motion else "torque"))
     robots = {label: stated_model(x.content, model) for label, x in findings.results.items()}
@@ -108,7 +110,7 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
     if ghost is not None:
         shadow = closed_log(model, job.read(LogEntry(Path(ghost)), model, needs="motion"))
         ghosts[Path(ghost).name] = (shadow.t, shadow.q)
-    torques, marks, notes = None, _payloads(findings.track), [f"Motion: {entry.path.name}."]
+    torques, marks, notes = None, _marks(job, findings.track), [f"Motion: {entry.path.name}."]
     if is_motion:
         if not model.free_flyer:  # else the forces of the ground are part of the torques
             used, further = _limits_used(job, motion, model)
@@ -156,7 +158,9 @@ def replay_identified(identification: TorqueIdentification) -> Replay:
     return replay(model, motion.t, motion.q, torques=torques, masses=masses, notes=notes, log=log)
 
 
-def _replay_commanded(job: Job, results: Mapping[str, Result], ghost: str | Path | None) -> Replay:
+def _replay_commanded(
+    job: Job, results: Mapping[str, Result], ghost: str | Path | None, marks: Sequence[Mark]
+) -> Replay:
     """Return the replay of a log of commands: measured, commanded and simulated robot."""
     (entry,) = job.identification
     first = next(iter(results.values()))
@@ -179,7 +183,9 @@ def _replay_commanded(job: Job, results: Mapping[str, Result], ghost: str | Path
         f"Simulated position error, RMS [mrad or mm]: {listed(worst, 3)}.",
     ]
     torques, q, name = Torques(log.t, log.q, shown, lag, "position"), log.q + zero, entry.path.name
-    return replay(model, log.t, q, torques=torques, ghosts=ghosts, notes=notes, log=name)
+    return replay(
+        model, log.t, q, torques=torques, ghosts=ghosts, marks=marks, notes=notes, log=name
+    )
 
 
 def _base_poses(job: Job, entry: LogEntry, log: Log) -> Array | None:
@@ -257,10 +263,13 @@ def _bands(track: Mapping[str, Any], folder: Path) -> Bands:
     return Bands(columns["time"], list(names), list(units), theta, std_error)
 
 
-def _payloads(track: Mapping[str, Any] | None) -> list[Mark]:
+def _marks(job: Job, track: Mapping[str, Any] | None) -> list[Mark]:
+    """Return marks at the validated parts of the log, and at the payloads of a track."""
     words = "payload {mass:.2f} ± {std_error:.2f} kg on {body}"
     changes = [] if track is None else track["changes"]
-    return [Mark(x["onset"], words.format(**x["payload"]), "payload") for x in changes]
+    parts = [x.start for x in job.validation if x.start is not None]
+    marks = [Mark(start, "start of the validated part", "validation") for start in parts]
+    return marks + [Mark(x["onset"], words.format(**x["payload"]), "payload") for x in changes]
 
 
 def _limits_used(job: Job, motion: Log, model: RobotModel) -> tuple[list[Mark], list[str]]:

@@ -85,8 +85,8 @@ def simulate(
     duration = course.duration if settings.duration is None else settings.duration
     if duration > course.duration + 1e-9:
         raise SettingsError(
-            f"duration is {duration:g} s, wanted at most the {course.duration:g} s of the motion; "
-            "reduce it, or give a longer motion"
+            f"duration is {duration:g} s, expected at most the {course.duration:g} s of the "
+            "motion; reduce it, or give a longer motion"
         )
     rng = np.random.default_rng(settings.seed)
     pi = draw_parameters(model, settings.truth, rng)
@@ -201,8 +201,8 @@ def simulation_from_flags(options: argparse.Namespace) -> tuple[Job, Simulation]
     for joint, entries in drives.items():
         if named := [entry for entry in entries if isinstance(entry, str)]:
             raise SettingsError(
-                f"{options.plant}: drives.{joint} has {named[0]!r}, wanted a term with its shape, "
-                "as { term = 'Stribeck', speed = 0.1 }"
+                f"{options.plant}: drives.{joint} has {named[0]!r}, expected a term with its "
+                "shape, as { term = 'Stribeck', speed = 0.1 }"
             )
     if Path(options.source).suffix == ".toml":
         if drives:
@@ -236,9 +236,9 @@ def _show(content: dict[str, Any]) -> None:
         share = 100 * joint["at_limit"]
         print(f"; at the effort limit for {share:.2g} % of the time" if share > 0 else "")
         if joint["range"] < _HALF * joint["commanded"]:
-            moves = f"moves {joint['range']:.2g} {unit}, wanted the {joint['commanded']:.2g} {unit}"
+            moves = f"moves {joint['range']:.2g} {unit}, expected {joint['commanded']:.2g} {unit}"
             values = f'[truth] values = {{ "{name}.coulomb" = 0 }}'
             echo(
-                f"  warning: {name} {moves} commanded. If its friction stops it, state it in the "
+                f"  warning: {name} {moves}. If its friction stops it, state it in the "
                 f"file of --plant: {values}, or larger gains under [controller]", "  ", "warning",
             )  # fmt: skip

@@ -94,7 +94,7 @@ class BaseMotion:
         if len(wrong := np.flatnonzero(np.abs(sizes - 1.0) > _UNIT)):
             raise DataError(
                 f"the quaternion of the base has length {sizes[wrong[0]]:g} in row {wrong[0]}, "
-                "wanted 1, in the order qx qy qz qw"
+                "expected 1, in the order qx qy qz qw"
             )
         pose = self.pose.copy()
         pose[:, 3:] *= continuous_signs(pose[:, 3:]) / sizes[:, None]
@@ -246,8 +246,8 @@ def _radians(angles: Array) -> Array:
     largest = float(np.abs(angles[:, :2]).max(initial=0.0))
     if largest > 2.0 * np.pi:
         raise DataError(
-            f"base_roll and base_pitch are up to {largest:.4g}, wanted at most pi: they look like "
-            "degrees. Convert base_roll, base_pitch and base_yaw to rad",
+            f"base_roll and base_pitch are up to {largest:.4g}, expected at most pi: they look "
+            "like degrees. Convert base_roll, base_pitch and base_yaw to rad",
             code="angle_unit",
         )
     return angles
@@ -262,7 +262,7 @@ def contacts_of(values: Array, wanted: BaseColumns, where: str) -> dict[str, Arr
         wrong = np.flatnonzero((flags != 0.0) & (flags != 1.0))
         if len(wrong):
             raise DataError(
-                f"{where}: contact_{link} is {flags[wrong[0]]:g} in row {wrong[0]}, wanted 0 or "
+                f"{where}: contact_{link} is {flags[wrong[0]]:g} in row {wrong[0]}, expected 0 or "
                 "1; if it is a force, state threshold in [[contact]]"
             )
     return {link: flags == 1.0 for link, flags in zip(links, values.T, strict=True)}
@@ -358,7 +358,7 @@ def quaternions_of_angles(angles: Array) -> Array:
 def _checked(values: ArrayLike, name: str, width: int) -> Array:
     array = real_numbers(values, f"{name} of the base")
     if array.ndim != 2 or array.shape[1] != width:
-        raise DataError(f"{name} of the base has shape {array.shape}, wanted (N, {width})")
+        raise DataError(f"{name} of the base has shape {array.shape}, expected (N, {width})")
     if not np.isfinite(array).all():
         row = int(np.argmin(np.isfinite(array).all(axis=1)))
         raise DataError(f"{name} of the base is not finite in row {row}")

@@ -103,12 +103,12 @@ class Log:
                 "zeros"
             )
         if len(self.t) < 2:
-            raise DataError(f"{where} has {len(self.t)} rows, wanted at least 2; record longer")
+            raise DataError(f"{where} has {len(self.t)} rows, expected at least 2; record longer")
         require_increasing(self.t, where)
         require_kind(self.base, (BaseMotion, type(None)), "base", "a BaseMotion")
         if self.base is not None and len(self.base.pose) != len(self.t):
             raise DataError(
-                f"{where}: the pose of the base has {len(self.base.pose)} rows, wanted "
+                f"{where}: the pose of the base has {len(self.base.pose)} rows, expected "
                 f"{len(self.t)}, one for each time stamp"
             )
         for kind, dtype in (("contacts", np.bool_), ("wrenches", np.float64)):
@@ -120,7 +120,7 @@ class Log:
             for name, values in own.items():
                 if values.shape != self.t.shape:
                     raise DataError(
-                        f"{where}: {name!r} of {kind} has shape {values.shape}, wanted "
+                        f"{where}: {name!r} of {kind} has shape {values.shape}, expected "
                         f"{self.t.shape}"
                     )
                 require_finite(values[:, None], self.t, [f"{kind} {name}"], where)
@@ -147,7 +147,7 @@ class Log:
         for name, limit in (("start", start), ("end", end)):
             is_end = isinstance(limit, float | np.floating) and bool(np.isinf(limit))
             if not (limit is None or is_end or is_number(limit)):
-                raise DataError(f"{name} is {str(limit)[:60]!r}, wanted a time [s], or None")
+                raise DataError(f"{name} is {str(limit)[:60]!r}, expected a time [s], or None")
         within = slice(*rows_within(self.t, self.name, start, end))
         return replace(
             self,
@@ -185,7 +185,7 @@ class Log:
         """
         sign = real_numbers(sign, "sign")
         if sign.shape != (len(self.joints),):
-            raise DataError(f"sign has shape {sign.shape}, wanted ({len(self.joints)},)")
+            raise DataError(f"sign has shape {sign.shape}, expected ({len(self.joints)},)")
         return replace(self, **{name: sign * x for name, x in self._arrays().items()})
 
     def _arrays(self) -> dict[str, Any]:
@@ -247,22 +247,22 @@ class Trajectory:
             segment = np.asarray(None)
         if segment.shape != self.t.shape or segment.dtype.kind not in "iu":
             raise DataError(
-                f"trajectory: segment is {segment.dtype} of shape {segment.shape}, wanted integers "
-                f"of shape {self.t.shape}"
+                f"trajectory: segment is {segment.dtype} of shape {segment.shape}, expected "
+                f"integers of shape {self.t.shape}"
             )
         object.__setattr__(self, "segment", frozen(segment, np.int_))
         if self.direction is not None:
             direction = frozen(self.direction)
             if direction.ndim != 2 or len(direction) != len(self.t):
                 raise DataError(
-                    f"trajectory: direction has shape {direction.shape}, wanted ({len(self.t)}, c)"
-                    ": a column for each speed that determines Coulomb friction"
+                    f"trajectory: direction has shape {direction.shape}, expected ({len(self.t)}, "
+                    "c): a column for each speed that determines Coulomb friction"
                 )
             names = [f"direction {k}" for k in range(direction.shape[1])]
             require_finite(direction, self.t, names, "trajectory")
             object.__setattr__(self, "direction", direction)
         if self.rate is not None and not (is_number(self.rate) and self.rate > 0):
-            raise DataError(f"trajectory: rate is {self.rate!r}, wanted a positive number or None")
+            raise DataError(f"trajectory: rate is {self.rate!r}, expected more than 0 or None")
 
     def __repr__(self) -> str:
         segments = len(np.unique(self.segment))
@@ -295,7 +295,7 @@ class Trajectory:
             step: The number n.
         """
         if step < 1:
-            raise SettingsError(f"step is {step}, wanted 1 or more")
+            raise SettingsError(f"step is {step}, expected 1 or more")
         if step == 1:
             return self
         thinned = self.at(slice(None, None, step))
@@ -350,7 +350,7 @@ def _settle(owner: Log | Trajectory, where: str, arrays: dict[str, Array | None]
         raise DataError(f"{where}: joints contains {listed(twice)} twice; name each joint once")
     t = real_numbers(owner.t, f"{where}: t")
     if t.ndim != 1:
-        raise DataError(f"{where}: t has shape {t.shape}, wanted (N,)")
+        raise DataError(f"{where}: t has shape {t.shape}, expected (N,)")
     require_finite(t[:, None], t, ["time"], where)
     settled = {"t": t}
     for name, values in arrays.items():
@@ -360,7 +360,7 @@ def _settle(owner: Log | Trajectory, where: str, arrays: dict[str, Array | None]
         base = _base_width(owner, name)
         if array.shape != (len(t), base + len(joints)):
             raise DataError(
-                f"{where}: {name} has shape {array.shape}, wanted {(len(t), len(joints))}: a row "
+                f"{where}: {name} has shape {array.shape}, expected {(len(t), len(joints))}: a row "
                 f"for each time stamp, a column for each of the joints {listed(joints)}"
             )
         names = [f"{name}_{x}" for x in (*(f"base {k}" for k in range(base)), *joints)]
@@ -385,7 +385,7 @@ def _names(joints: object, where: str) -> tuple[str, ...]:
     is_list = isinstance(names, Iterable) and not isinstance(names, str | Mapping)
     labels: tuple[Any, ...] = tuple(names) if is_list else ()  # type: ignore[arg-type]
     if not labels or not all(isinstance(name, str) for name in labels):
-        raise DataError(f"{where}: joints is {joints!r}, wanted at least one name in a tuple")
+        raise DataError(f"{where}: joints is {joints!r}, expected at least one name in a tuple")
     return labels
 
 
@@ -417,7 +417,7 @@ def require_increasing(t: Array, where: str, first: int = 0) -> None:
             return
         raise DataError(
             f"{where}: {len(t)} rows lie within {float(t[-1] - t[0]):.3g} s, so the mean time step "
-            f"is {step:.3g} s, wanted at least {_SHORTEST:g} s; correct the time stamps or their "
+            f"is {step:.3g} s, expected at least {_SHORTEST:g} s; correct the time stamps or their "
             "unit",
             code="time_unit",
         )

@@ -58,7 +58,7 @@ class SignalSettings(Settings):
         8.0,
         "cut-off of the zero-phase Butterworth filter [Hz]; false for no filter",
         within=_HZ,
-        **or_false("cutoff is true, wanted a frequency [Hz], or false for no filter"),
+        **or_false("cutoff is true, expected a frequency [Hz], or false for no filter"),
     )
     order: int = setting(
         4,
@@ -136,7 +136,7 @@ class LogUnits(Settings):
             is_pair = isinstance(ends, Sequence) and len(ends) == 2 and all(map(is_number, ends))
             if not is_pair or ends[0] == ends[1]:
                 raise SettingsError(
-                    f"units: percent of {joint} is {ends!r}, wanted two different numbers, the "
+                    f"units: percent of {joint} is {ends!r}, expected two different numbers, the "
                     "positions at 0 and at 100 [rad or m]"
                 )
 
@@ -198,10 +198,10 @@ class LogSource(Settings):
         for name, topic in (("topic", self.topic), ("command", self.command)):
             require_kind(topic, (str, type(None)), name, "the name of a topic or group, or none")
         if len(set(self.names)) != len(self.names):
-            raise SettingsError("log: names has a name more than once; wanted one for each column")
+            raise SettingsError("log: names has a name twice; expected one for each column")
         for joint, name in self.joints.items():
             if not isinstance(name, str):
-                raise SettingsError(f"log: joints.{joint} is {name!r}, wanted a name")
+                raise SettingsError(f"log: joints.{joint} is {name!r}, expected a name")
 
 
 @dataclass(frozen=True)
@@ -267,7 +267,7 @@ class Transmission(Settings):
         super().__post_init__()
         count = len(self.joints)
         if not count:
-            raise SettingsError("transmission: joints is empty, wanted the names of driven joints")
+            raise SettingsError("transmission: joints is empty, expected names of driven joints")
         for noun in ("joints", "motors"):
             if twice := repeated(getattr(self, noun)):
                 raise SettingsError(
@@ -276,21 +276,21 @@ class Transmission(Settings):
         for key in ("motors", "efficiency", "offset"):
             if (given := len(getattr(self, key))) not in (0, count):
                 raise SettingsError(
-                    f"transmission of {listed(self.joints)}: {key} has {given} entries, wanted "
+                    f"transmission of {listed(self.joints)}: {key} has {given} entries, expected "
                     f"{count}, one per joint"
                 )
         for motor, share in zip(self.names, self.efficiency, strict=False):
             if not 0 < share <= 1:
                 raise SettingsError(
-                    f"transmission: efficiency of {motor!r} is {share:g}, wanted more than 0 and "
+                    f"transmission: efficiency of {motor!r} is {share:g}, expected more than 0 and "
                     "at most 1"
                 )
         if not isinstance(self.matrix, str):
             self._check_matrix()
         elif self.matrix != "urdf":
             raise SettingsError(
-                f"transmission: matrix is {self.matrix!r}, wanted rows of numbers, a list of gear "
-                "ratios, or 'urdf'"
+                f"transmission: matrix is {self.matrix!r}, expected rows of numbers, a list of "
+                "gear ratios, or 'urdf'"
             )
 
     @property
@@ -354,8 +354,8 @@ class Transmission(Settings):
             T = np.empty(0)
         if T.shape not in ((count,), (count, count)) or not (np.abs(T) <= 1e30).all():
             raise SettingsError(
-                f"transmission of {listed(self.joints)}: matrix is {shown}, wanted {count} rows of "
-                f"{count} numbers, one row per motor, or {count} gear ratios"
+                f"transmission of {listed(self.joints)}: matrix is {shown}, expected {count} rows "
+                f"of {count} numbers, one row per motor, or {count} gear ratios"
             )
         size = np.linalg.norm(self.T, axis=1, keepdims=True)
         sizes = np.linalg.svd(self.T / np.where(size > 0, size, 1.0), compute_uv=False)

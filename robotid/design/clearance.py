@@ -118,7 +118,7 @@ class Clearance:
         import coal
 
         if not least >= 0:
-            raise SettingsError(f"clearance is {least}, wanted 0 m or more")
+            raise SettingsError(f"clearance is {least}, expected 0 m or more")
         self.least, self._model, self._tree = least, model, fixed_tree(model)
         self._ratios = model.velocity_map  # of joints by body, (m, n)
         clouds, self.unread = link_clouds(model)
@@ -376,6 +376,6 @@ def _corners(box: Box) -> Array:
     if not (low < high).all():
         raise SettingsError(
             f"box {box.name!r} reaches from {listed(map(str, box.low))} to "
-            f"{listed(map(str, box.high))}, wanted a low corner below the high one in x, y and z"
+            f"{listed(map(str, box.high))}, expected a low corner below the high one in x, y and z"
         )
     return np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T

@@ -83,7 +83,7 @@ class FourierBasis:
     def __post_init__(self) -> None:
         if self.harmonics < 2:
             raise SettingsError(
-                f"harmonics is {self.harmonics}, wanted 2 or more: one cannot start at rest"
+                f"harmonics is {self.harmonics}, expected 2 or more: one cannot start at rest"
             )
 
     @property
@@ -342,7 +342,7 @@ class Designer:
             C = _scaled(C, max(1.0 - 0.01 * 2.0**k, 0.5))
         raise NotConvergedError(
             f"between the samples of the design {contact}, margin "
-            f"{1e3 * (contact.margin if contact else 0.0):.2g} mm, wanted 0 or more; raise the "
+            f"{1e3 * (contact.margin if contact else 0.0):.2g} mm, expected 0 or more; raise the "
             "clearance or try another seed",
             "max_iterations",
         )

@@ -93,7 +93,7 @@ class MotionSettings(Settings):
         for name in ("velocity", "torque", "acceleration", "jerk", "power", "noise"):
             for joint, value in getattr(self, name).items():
                 if not SIZE.holds(value):
-                    raise SettingsError(f"{name} of {joint!r} is {value:g}, wanted {SIZE.words}")
+                    raise SettingsError(f"{name} of {joint!r} is {value:g}, expected {SIZE.words}")
 
 
 def check_motion_file(target: str | Path) -> None:
@@ -108,7 +108,7 @@ def write_motion(
     """Write a motion: .csv or .parquet as a log, .yaml for ROS 2, .script for Universal Robots."""
     path = Path(target)
     if not 0 < rate < np.inf:
-        raise SettingsError(f"rate is {rate:g}, wanted a positive number of rows per second")
+        raise SettingsError(f"rate is {rate:g}, expected a positive number of rows per second")
     texts: Mapping[str, Callable[..., Iterator[str]]] = {".yaml": _ros, ".script": _ur}
     if path.suffix == ".script":
         rate = 1.0 / _UR_STEP
@@ -139,7 +139,7 @@ def _ur(joints: Sequence[str], t: Array, q: Array, v: Array, a: Array) -> Iterat
     """Yield the lines of a URScript program."""
     if len(joints) != _UR_JOINTS:
         raise SettingsError(
-            f"a .script is for Universal Robots: this robot has {len(joints)} joints, wanted "
+            f"a .script is for Universal Robots: this robot has {len(joints)} joints, expected "
             f"{_UR_JOINTS}; write .csv, .parquet or .yaml"
         )
     yield "def excitation():"

@@ -99,7 +99,7 @@ class MotionInformation:
     def __post_init__(self) -> None:
         wanted = (len(self.mapping.independent),)
         if self.beta.shape != wanted:
-            raise DataError(f"beta has shape {self.beta.shape}, wanted {wanted}")
+            raise DataError(f"beta has shape {self.beta.shape}, expected {wanted}")
         regressor = MotionRegressor(self.model, self.mapping.independent)
         object.__setattr__(self, "_regressor", regressor)
 
@@ -201,7 +201,7 @@ class MotionInformation:
 def criterion(name: str, F: Array, widest: Array | None = None) -> tuple[float, Array]:
     """Return a criterion of information and its gradient: Pukelsheim (2006), chapter 6."""
     if name not in CRITERIA:
-        raise SettingsError(f"criterion is {name!r}, wanted one of {', '.join(CRITERIA)}")
+        raise SettingsError(f"criterion is {name!r}, expected one of {', '.join(CRITERIA)}")
     size = len(F)
     if name == "D":
         L, failed = scipy.linalg.lapack.dpotrf(F, lower=1)

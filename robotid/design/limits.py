@@ -47,7 +47,7 @@ class MotionLimits:
     ) -> "MotionLimits":
         """Return the limits stated in a URDF, and those stated in addition."""
         if not 0 < share <= 1:
-            raise SettingsError(f"share is {share}, wanted more than 0 and at most 1")
+            raise SettingsError(f"share is {share}, expected more than 0 and at most 1")
         fastest = np.array([j.velocity if j.velocity > 0 else np.inf for j in model.limits])
         fastest = np.minimum(share * fastest, _each(model, velocity, "velocity"))
         missing = []
@@ -89,7 +89,7 @@ def _each(model: RobotModel, stated: float | Mapping[str, float], what: str) -> 
                 f"{listed(model.joints)}"
             )
         if not value > 0:
-            raise SettingsError(f"{what} of {name} is {value:g}, wanted a positive number")
+            raise SettingsError(f"{what} of {name} is {value:g}, expected a positive number")
     return np.array([by_name.get(name, np.inf) for name in model.joints], dtype=float)
 
 
@@ -175,7 +175,7 @@ class Postures:
             return f"{tried}: {alone}"
         most = [f"{words} in {100 * share:.0f} %" for share, _, words in broken]
         return (
-            f"{tried}: each violates a limit or a distance, wanted one without violations. Most "
+            f"{tried}: each violates a limit or a distance, expected one without violations. Most "
             f"frequent: {listed(most, 3)}. Narrow the position limits of these joints, lock joints "
             "that need not move, lower the clearance, or omit the collision check (--clearance "
             "none)"
@@ -199,7 +199,7 @@ class Postures:
             wanted = float(self.clearance.required[pair] + self.clearance.spare[pair, 0])
             most = (
                 f"the distance of {two} is {1e3 * (margins[pair].max() + wanted):.1f} mm at most, "
-                f"wanted {1e3 * wanted:.1f} mm; lower the clearance, or move the floor and the "
+                f"expected {1e3 * wanted:.1f} mm; lower the clearance, or move the floor and the "
                 "boxes"
             )
             some = f"{two} are nearer than {1e3 * wanted:.1f} mm"

@@ -105,9 +105,9 @@ def assumed_noise(
                 f"{listed(model.joints)}{suggestion(str(joint), model.joints)}"
             )
         if not (is_number(value) and SIZE.holds(value)):
-            raise SettingsError(f"noise of {joint!r} is {value!r}, wanted {SIZE.words}")
+            raise SettingsError(f"noise of {joint!r} is {value!r}, expected {SIZE.words}")
     if correlation is not None and not 0 <= correlation < np.inf:
-        raise SettingsError(f"correlation is {correlation:g} s, wanted 0 (white noise) or more")
+        raise SettingsError(f"correlation is {correlation:g} s, expected 0 (white noise) or more")
     is_stated = np.isin(model.joints, list(stated))
     values = np.array([stated.get(joint, np.nan) for joint in model.joints])
     std = _NOISE * size if earlier is None else earlier.std

@@ -2,8 +2,8 @@
 
 An entry has the severity, the message as a template, the remedy that follows it, the reason of a
 verdict (``verdict``), whether an error may be ignored (``ignorable``), the next step
-(``step``) and the page of the documentation (``page``). Tables of an entry have parts of its
-sentences, of which a word given to ``finding`` chooses one.
+(``step``) and the page of the documentation (``page``, with its ``cause`` and ``about``). Tables of
+an entry have parts of its sentences, of which a word given to ``finding`` chooses one.
 """
 
 import tomllib

@@ -52,13 +52,13 @@ class BaseMapping:
     def to_base(self, pi: Array) -> Array:
         """Return the base parameters beta = K pi, shape (b,): pi (p,)."""
         if pi.shape != (self.K.shape[1],):
-            raise DataError(f"pi has shape {pi.shape}, wanted ({self.K.shape[1]},)")
+            raise DataError(f"pi has shape {pi.shape}, expected ({self.K.shape[1]},)")
         return self.K @ pi
 
     def to_standard(self, beta: Array, prior: Array, spread: Array | None = None) -> Array:
         """Return pi = prior + G (beta - K prior), the nearest to a prior in units of the spread."""
         if beta.shape != (len(self.K),):
-            raise DataError(f"beta has shape {beta.shape}, wanted ({len(self.K)},)")
+            raise DataError(f"beta has shape {beta.shape}, expected ({len(self.K)},)")
         return np.asarray(prior + self.gain(spread) @ (beta - self.to_base(prior)))
 
     def gain(self, spread: Array | None = None) -> Array:
@@ -72,7 +72,7 @@ class BaseMapping:
         """Return the problem in the b base parameters, W_b beta = tau."""
         if problem.names != self.names:
             raise DataError(
-                f"the problem has {len(problem.names)} columns, wanted the {len(self.names)} of "
+                f"the problem has {len(problem.names)} columns, expected the {len(self.names)} of "
                 "the mapping; build both from one model"
             )
         return problem.select(self.independent)

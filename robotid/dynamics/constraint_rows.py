@@ -189,7 +189,7 @@ def touching(model: RobotModel, motion: Trajectory) -> Array:
         flagged = [not x.always for x in model.contacts]
         if motion.contacts.shape[1] != sum(flagged):
             raise DataError(
-                f"the log has contact flags of {motion.contacts.shape[1]} contacts, wanted "
+                f"the log has contact flags of {motion.contacts.shape[1]} contacts, expected "
                 f"{sum(flagged)}, one for each contact that may be in the air and is not measured "
                 "completely; leave out the others"
             )
@@ -243,7 +243,7 @@ def _imu_frame(model: RobotModel, link: str) -> ImuFrame:
     if frame.parentJoint != 1:
         raise ModelError(
             f"imu in [base] is {link!r}, which moves relative to the root link "
-            f"{model.tree.root!r}; wanted a link that is fixed to it"
+            f"{model.tree.root!r}; expected a link that is fixed to it"
         )
     place = frame.placement
     gravity: Array = model.pin_model.gravity.linear

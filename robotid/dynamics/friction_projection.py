@@ -50,8 +50,8 @@ class DriveMoments:
         terms, products = tuple(table["terms"]), np.array(table["products"], dtype=float)
         if products.shape != (len(terms), len(terms)) or not np.isfinite(products).all():
             raise DataError(
-                f"drive_moments: products have shape {products.shape}, wanted a finite matrix over "
-                f"the {len(terms)} terms; identify again"
+                f"drive_moments: products have shape {products.shape}, expected a finite matrix "
+                f"over the {len(terms)} terms; identify again"
             )
         return cls(terms, products, float(table["torque"]))
 

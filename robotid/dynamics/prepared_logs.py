@@ -97,8 +97,8 @@ def _closed(model: RobotModel, log: Log, q: Array, missing: Array) -> Array:
     what = f"no position of {listed(joints)} closes" if joints else "the positions do not close"
     raise DataError(
         f"{log.name}: {what} the loop {model.loops[loop].name} at t = {seconds(log.t[k])} s: "
-        f"{gaps[k, loop]:.3g} m remain, wanted at most {allowed:.2g} m. Correct the zero positions "
-        "or signs of the logged joints, or the frames of the loop",
+        f"{gaps[k, loop]:.3g} m remain, expected at most {allowed:.2g} m. Correct the zero "
+        "positions or signs of the logged joints, or the frames of the loop",
         code="open_loop",
     )
 

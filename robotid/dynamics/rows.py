@@ -194,7 +194,7 @@ def drive_values(
     states, wanted = np.empty((len(v), 0)) if memory is None else memory, layout.remembering
     if states.shape != (len(v), len(wanted)):
         raise DataError(
-            f"memory has shape {states.shape}, wanted {(len(v), len(wanted))}: a column for each "
+            f"memory has shape {states.shape}, expected {(len(v), len(wanted))}: a column for each "
             "drive parameter with internal state or load; call remember() with the trajectory first"
         )
     values = np.empty((len(layout.drive_parameters), len(v)))
@@ -272,7 +272,7 @@ def friction_directions(layout: ParameterLayout, v: Array, direction: Array | No
     wanted = (len(v), len(speeds))
     if direction.shape != wanted:
         raise DataError(
-            f"direction has shape {direction.shape}, wanted {wanted}: a column for each Coulomb "
+            f"direction has shape {direction.shape}, expected {wanted}: a column for each Coulomb "
             "parameter of the model; process the log with the speeds of this model"
         )
     return direction
@@ -444,13 +444,13 @@ def trajectory_rows(
     """Return all rows of a trajectory with all standard parameters: weight (N, n_rows)."""
     if trajectory.joints != model.joints:
         raise DataError(
-            f"the trajectory has the joints {listed(trajectory.joints)}, wanted those of the "
+            f"the trajectory has the joints {listed(trajectory.joints)}, expected those of the "
             f"model, {listed(model.joints)}; read the log with joints=model.joints"
         )
     shape = (len(trajectory.t), model.n_rows)
     weights = np.broadcast_to(1.0, shape) if weight is None else weight
     if weights.shape != shape:
-        raise DataError(f"weight has shape {weights.shape}, wanted {shape}")
+        raise DataError(f"weight has shape {weights.shape}, expected {shape}")
     every, engine = np.arange(len(model.layout.names)), choose_engine(model, shape[0], compiled)
     inertial = kept_rows(model, trajectory)
     return TrajectoryRows(model, trajectory, weights, model.support, every, engine, inertial)

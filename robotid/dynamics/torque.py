@@ -60,12 +60,12 @@ def joint_torque_regressor(
     """
     wanted = (len(q), model.n_rows)
     if v.shape != wanted or a.shape != wanted:
-        raise DataError(f"v and a have shapes {v.shape} and {a.shape}, wanted {wanted}")
+        raise DataError(f"v and a have shapes {v.shape} and {a.shape}, expected {wanted}")
     for name, values in (("v", v), ("a", a)):
         if not np.isfinite(values).all():
             k, j = np.argwhere(~np.isfinite(values))[0]
             row = model.row_names[j]
-            raise DataError(f"{name}[{k}] of {row} is {values[k, j]}, wanted a finite number")
+            raise DataError(f"{name}[{k}] of {row} is {values[k, j]}, expected a finite number")
     Y = np.zeros((len(q), model.n_rows, len(model.layout.names)))
     inertial_rows(model, q, v, a).write(slice(None), Y)
     _write_drives(model, (q, v, a), direction, memory, Y)
@@ -90,7 +90,7 @@ class InstantRegressor:
 
     def __init__(self, model: RobotModel, columns: Array) -> None:
         if model.free_flyer:
-            raise DataError("the base floats, wanted a robot with a fixed base")
+            raise DataError("the base floats, expected a robot with a fixed base")
         model.require_fixed("recursive identification")
         self._model, self._data = model, model.pin_model.createData()
         self._columns = np.asarray(columns)
@@ -263,7 +263,7 @@ def predict_instants(
     width = len(model.joints) + 7 * model.free_flyer
     if q.ndim not in (1, 2) or q.shape[-1] != width:
         raise DataError(
-            f"q has shape {q.shape}, wanted ({width},) or (N, {width}): "
+            f"q has shape {q.shape}, expected ({width},) or (N, {width}): "
             f"{'the pose of the base, then ' if model.free_flyer else ''}a column for each of "
             f"{listed(model.joints)}"
         )
@@ -272,7 +272,7 @@ def predict_instants(
         given[name] = np.zeros(wanted) if x is None else real_numbers(x, name)
         if given[name].shape != wanted:
             raise DataError(
-                f"{name} has shape {given[name].shape}, wanted {wanted}, as q is {q.shape}: a "
+                f"{name} has shape {given[name].shape}, expected {wanted}, as q is {q.shape}: a "
                 f"column for each of {listed(model.row_names)}"
             )
     q, v, a = map(np.atleast_2d, given.values())

@@ -260,7 +260,7 @@ class WorkPlan:
 def require_workers(workers: int) -> int:
     """Return a number of workers, which must be at least 1."""
     if workers < 1:
-        raise SettingsError(f"workers is {workers}, wanted at least 1")
+        raise SettingsError(f"workers is {workers}, expected at least 1")
     return workers
 
 

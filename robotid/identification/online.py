@@ -378,7 +378,7 @@ class OnlineIdentifier:
         arrays = [real_numbers(x, name) for name, x in zip(names, (q, *rest), strict=True)]
         n, shapes = len(self.model.joints), [np.shape(x) for x in arrays]
         if any(shape != (n,) for shape in shapes):
-            raise DataError(f"{listed(names)} have shapes {listed(shapes)}, wanted ({n},) each")
+            raise DataError(f"{listed(names)} have shapes {listed(shapes)}, expected ({n},) each")
         if not (np.isfinite(t) and all(np.isfinite(x).all() for x in arrays)):
             raise DataError(f"the sample at t = {t:g} s is not finite, so it was refused")
         if t <= self._now:

@@ -257,7 +257,7 @@ def identify_payload(
     for what, runs in (("logs", loaded), ("reference", without)):
         if not runs.fitted:
             raise DataError(
-                f"{what} has no log, wanted at least one: logs with the payload, and a reference "
+                f"{what} has no log, expected at least one: logs with the payload, and a reference "
                 "without it"
             )
 
@@ -438,7 +438,7 @@ def _check_known(
             )
         if not (is_number(mass) and 0 < mass < 1e6):
             raise SettingsError(
-                f"the mass of the payload on {link} is {mass!r} kg, wanted more than 0 and less "
+                f"the mass of the payload on {link} is {mass!r} kg, expected more than 0 and less "
                 "than 1e6"
             )
     unknown = [joint for joint in gains if joint not in model.joints]

@@ -85,11 +85,11 @@ def robot_of(model: RobotModel | str | Path, logs: object) -> RobotModel:
     if is_robot or (suffixes[1] in _ROBOTS and suffixes[0] not in _ROBOTS):
         what = f"the file {Path(str(model)).name}" if is_path else f"a {kind}"
         raise ModelError(
-            f"model is {what}, and the robot is given as the logs; wanted: the robot first, then "
+            f"model is {what}, and the robot is given as the logs; expected: the robot first, then "
             "the logs; swap the two"
         )
     if not is_path:
-        raise ModelError(f"model is a {kind}, wanted a RobotModel or the path of a URDF")
+        raise ModelError(f"model is a {kind}, expected a RobotModel or the path of a URDF")
     return with_assumed_inertials(RobotModel.from_urdf(model))
 
 

@@ -365,7 +365,7 @@ class PaperSettings:
     def __post_init__(self) -> None:
         for name in ("iterations", "longest", "runs", "patience"):
             if getattr(self, name) < 1:
-                raise SettingsError(f"{name} is {getattr(self, name)}, wanted 1 or more")
+                raise SettingsError(f"{name} is {getattr(self, name)}, expected 1 or more")
 
 
 @dataclass(frozen=True)
@@ -398,7 +398,7 @@ def planar_dynamics(form: Form = "corrected") -> LinearDynamics:
 def paper_arm(name: str) -> tuple[LinearDynamics, Array]:
     """Return one of the three models and its true parameters, (c,) [kg m^2]."""
     if name not in MODELS:
-        raise SettingsError(f"model is {name!r}, wanted one of {listed(MODELS)}")
+        raise SettingsError(f"model is {name!r}, expected one of {listed(MODELS)}")
     P = parameters(PAPER_LINKS) if name == "physical" else PAPER_PARAMETERS
     return planar_dynamics(MODELS[name]), P
 

@@ -242,7 +242,7 @@ def read_surfaces(path: Path) -> tuple[Surface, ...]:
     import trimesh
 
     if path.suffix.lower() not in _FORMATS:
-        raise ValueError(f"{path.name} is not a mesh, wanted {', '.join(_FORMATS)}")
+        raise ValueError(f"{path.name} is not a mesh, expected {', '.join(_FORMATS)}")
     by_colour: dict[tuple[float, ...] | None, list[Surface]] = {}
     try:
         if path.stat().st_size > _MOST_BYTES:

@@ -24,8 +24,7 @@ class Contact(Settings):
 
     frame: str = setting(
         MISSING,
-        "the link, whose frame is at the point or on the surface of contact; the centre of the "
-        "foot if it has a radius",
+        "the link whose frame is at the contact; at the centre of the foot if it has a radius",
     )
     kind: str = setting(
         "point",
@@ -34,28 +33,28 @@ class Contact(Settings):
     )
     measured: tuple[str, ...] = setting(
         (),
-        "components of the wrench of the ground on the link that logs have as wrench_fz_<link>, of "
-        "fx to mz, with the axes of the world and the origin of the link; the others are unknown",
+        "measured components of the wrench of the ground on the link, fx to mz (columns "
+        "wrench_fz_<link>), at the origin of the link; the others are unknown",
     )
     always: bool = setting(
         False,
         "whether it always touches the ground (true if all components are measured); else logs "
-        "have contact_<link>, 1 or 0, or it is found",
+        "have contact_<link>, or contacts are found",
     )
     radius: float = setting(
         0.0,
-        "of a ball that rolls on level ground: its ground is this far below the frame [m]",
+        "radius of a round foot, which rolls on level ground [m]",
         within=_LENGTH,
     )
     uncertainty: float | None = setting(
         None,
-        "standard deviation of the point of contact along each axis [m], an error of the "
-        "intervals; estimated from the logs if not stated",
+        "standard deviation of the point of contact along each axis [m], part of the "
+        "intervals; default: estimated from the logs",
         within=_LENGTH,
     )
     axes: str = setting(
         "world",
-        "axes of the components: world, or link, as a sensor in it measures",
+        "axes of the components: world, or link (a sensor in the link)",
         among=("world", "link"),
         dump=lambda axes: None if axes == "world" else axes,
     )
@@ -75,13 +74,13 @@ class Contact(Settings):
         for component in require_each(self.measured, str, "measured", f"a list of {listed(known)}"):
             if component not in known or self.measured.count(component) > 1:
                 raise SettingsError(
-                    f"measured of the {self.kind} contact {self.frame!r} has {component!r}, wanted "
-                    f"some of {listed(known)}, each once"
+                    f"measured of the {self.kind} contact {self.frame!r} has {component!r}, "
+                    f"expected some of {listed(known)}, each once"
                 )
         require_flag(self.always, "always")
         if self.radius > 0.0 and self.kind != "point":
             raise SettingsError(
-                f"radius of the {self.kind} contact {self.frame!r} is {self.radius:g}, wanted a "
+                f"radius of the {self.kind} contact {self.frame!r} is {self.radius:g}, expected a "
                 "positive length [m] of a point contact, or 0"
             )
         if self.is_measured:
@@ -143,11 +142,11 @@ class Loop(Settings):
         super().__post_init__()
         if len(self.frames) != 2 or self.frames[0] == self.frames[1]:
             found = listed(self.frames) or "none"
-            raise SettingsError(f"loop has the frames {found}, wanted two links")
+            raise SettingsError(f"loop has the frames {found}, expected two links")
         axis = require_each(self.axis, (int, float), "axis of a loop", "x, y, z")
         if len(axis) != 3 or not 1e-6 < np.linalg.norm(np.array(axis, dtype=float)) < np.inf:
             raise SettingsError(
-                f"axis of loop {listed(self.frames)} is {self.axis}, wanted x, y, z"
+                f"axis of loop {listed(self.frames)} is {self.axis}, expected x, y, z"
             )
 
     @property

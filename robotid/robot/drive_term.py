@@ -91,10 +91,10 @@ class DriveTerm(ABC):
                 is_right = is_number(value) and low <= value <= high
                 wanted = f"{low:g} to {high:g}"
             if not is_right:
-                raise SettingsError(f"{kind}: {f.name} is {value!r}, wanted {wanted}")
+                raise SettingsError(f"{kind}: {f.name} is {value!r}, expected {wanted}")
         if any(getattr(self, low) >= getattr(self, high) for low, high in pairwise(self.rising)):
             values = ", ".join(f"{key} = {getattr(self, key):g}" for key in self.rising)
-            raise SettingsError(f"{kind}: {values}, wanted increasing values")
+            raise SettingsError(f"{kind}: {values}, expected increasing values")
 
     @property
     def name(self) -> str:

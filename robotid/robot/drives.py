@@ -534,8 +534,8 @@ def wanted_families(
     unknown_joints = [joint for joint in stated if joint not in (*joints, "*")]
     if unknown_joints:
         raise SettingsError(
-            f"friction is stated for {listed(unknown_joints)}, wanted joints that are identified: "
-            f"{listed(joints)}"
+            f"friction is stated for {listed(unknown_joints)}, expected joints that are "
+            f"identified: {listed(joints)}"
         )
     wanted: dict[str, tuple[str, ...] | None] = {}
     for joint in joints:
@@ -544,7 +544,7 @@ def wanted_families(
         unknown = [name for name in families if name not in FAMILIES]
         if names != AUTO and unknown:
             raise SettingsError(
-                f"friction of {joint} has {listed(unknown)}, wanted auto, or some of "
+                f"friction of {joint} has {listed(unknown)}, expected auto, or some of "
                 f"{listed(FAMILIES)}"
             )
         wanted[joint] = None if names == AUTO else tuple(families)
@@ -555,12 +555,12 @@ def term_from_dict(table: Mapping[str, Any]) -> DriveTerm:
     """Return a term from its plain values, as of ``DriveTerm.to_dict``."""
     if not isinstance(table, Mapping):
         raise SettingsError(
-            f"a drive term is {table!r}, wanted a table, for example "
+            f"a drive term is {table!r}, expected a table, for example "
             "{ term = 'Stribeck', speed = 0.1 }"
         )
     kind = TERM_CLASSES.get(str(table.get("term")))
     if kind is None:
-        raise SettingsError(f"term is {table.get('term')!r}, wanted one of {listed(TERM_CLASSES)}")
+        raise SettingsError(f"term {table.get('term')!r} is not one of {listed(TERM_CLASSES)}")
     known: dict[str, Any] = {field.name: field.default for field in fields(kind)}
     values = {key: value for key, value in table.items() if key != "term"}
     for key, value in values.items():

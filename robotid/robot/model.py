@@ -149,7 +149,7 @@ class RobotModel:
         ):
             require_kind(word, str, name, f"one of {listed(known)}")
             if word not in known:
-                raise ModelError(f"{name} is {word!r}, wanted one of {listed(known)}")
+                raise ModelError(f"{name} is {word!r}, expected one of {listed(known)}")
         if dynamics == "static":
             terms, own_terms = _terms_at_rest(terms, own_terms, gravity)
         if not (tree.movable or free_flyer):
@@ -297,7 +297,7 @@ class RobotModel:
         """
         gravity = real_numbers(gravity, "gravity")
         if gravity.shape != (3,):
-            raise DataError(f"gravity has shape {gravity.shape}, wanted (3,)")
+            raise DataError(f"gravity has shape {gravity.shape}, expected (3,)")
         pin_model = self.pin_model.copy()
         pin_model.gravity.linear = gravity
         return replace(self, pin_model=pin_model)
@@ -337,11 +337,11 @@ class RobotModel:
         """
         pi, size = real_numbers(pi, "pi"), self.layout.n_inertial
         if pi.shape not in ((size,), (len(self.layout.names),)):
-            raise DataError(f"pi has shape {pi.shape}, wanted ({len(self.layout.names)},)")
+            raise DataError(f"pi has shape {pi.shape}, expected ({len(self.layout.names)},)")
         for i in np.flatnonzero(~(np.abs(pi[:size]) <= LARGEST_SETTING)).tolist():
             name, unit = self.layout.names[i], self.layout.units[i]
             raise DataError(
-                f"{name} is {pi[i]:g} {unit}, wanted a finite number below {LARGEST_SETTING:g}"
+                f"{name} is {pi[i]:g} {unit}, expected a finite number below {LARGEST_SETTING:g}"
             )
         copy = pin.Model(self.pin_model)
         for i, values in enumerate(pi[:size].reshape(-1, 10)):
@@ -357,18 +357,18 @@ class RobotModel:
         base, q = 7 if self.free_flyer else 0, real_numbers(q, "q")
         wanted = base + len(self.joints)
         if q.ndim != 2 or q.shape[1] != wanted:
-            raise DataError(f"q has shape {q.shape}, wanted (N, {wanted})")
+            raise DataError(f"q has shape {q.shape}, expected (N, {wanted})")
         if not (np.abs(q).max(initial=0.0) <= LARGEST):  # not NaN either
             row, column = np.argwhere(~(np.abs(q) <= LARGEST))[0].tolist()
             raise DataError(
-                f"q[{row}, {column}] is {q[row, column]:g}, wanted a number within +-{LARGEST:g}"
+                f"q[{row}, {column}] is {q[row, column]:g}, expected a number within +-{LARGEST:g}"
             )
         if self.free_flyer:
             sizes = np.linalg.norm(q[:, 3:7], axis=1)
             for row in np.flatnonzero(np.abs(sizes - 1.0) > TINY).tolist():
                 raise DataError(
-                    f"q[{row}, 3:7], the quaternion of the base, has length {sizes[row]:g}, wanted "
-                    "1, in the order qx qy qz qw"
+                    f"q[{row}, 3:7], the quaternion of the base, has length {sizes[row]:g}, "
+                    "expected 1, in the order qx qy qz qw"
                 )
         first = 6 if self.free_flyer else 0
         angles = q[:, base:] @ self.velocity_map[first:, first:].T + self.position_offset[first:]
@@ -451,7 +451,7 @@ def _terms_at_rest(
     """Return the drive terms that act at rest."""
     if not np.any(_gravity(gravity)):
         raise SettingsError(
-            "dynamics is 'static', but gravity is 0, wanted gravity that loads the joints"
+            "dynamics is 'static', but gravity is 0, expected gravity that loads the joints"
         )
     common = [x for x in terms if x not in TERMS or _acts_at_rest(TERMS[x])]
     return common, {name: list(filter(_acts_at_rest, own)) for name, own in own_terms.items()}
@@ -494,7 +494,7 @@ def _build(tree: Tree, free_flyer: bool, gravity: Sequence[float]) -> pin.Model:
     if lost or not math.isclose(mass, stated, rel_tol=1e-9):  # it omits what it cannot read
         raise ModelError(
             f"{Path(tree.path).name}: Pinocchio cannot read it: its model lacks {listed(lost)}, "
-            f"and has {mass:g} kg, wanted {stated:g} kg"
+            f"and has {mass:g} kg, expected {stated:g} kg"
         )
     model.gravity.linear = acceleration
     return model
@@ -508,7 +508,7 @@ def _gravity(gravity: Sequence[float]) -> Array:
     if acceleration.shape != (3,) or not (np.abs(acceleration) <= _STRONGEST).all():
         shown = listed(gravity) if isinstance(gravity, list | tuple) else repr(gravity)
         raise ModelError(
-            f"gravity is {shown}, wanted three finite numbers within +-{_STRONGEST:g} [m/s^2]"
+            f"gravity is {shown}, expected three finite numbers within +-{_STRONGEST:g} [m/s^2]"
         )
     return acceleration
 

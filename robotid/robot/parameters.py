@@ -56,7 +56,7 @@ class Coupling(Settings):
         for pair in require_each(self.ratios, (tuple, list), "ratios", wanted):
             is_pair = len(pair) == 2 and isinstance(pair[0], str) and isinstance(pair[1], Real)
             if not is_pair or isinstance(pair[1], bool):
-                raise SettingsError(f"ratios of {self.name!r} has {pair!r}, wanted {wanted}")
+                raise SettingsError(f"ratios of {self.name!r} has {pair!r}, expected {wanted}")
 
 
 @dataclass(frozen=True)
@@ -81,37 +81,37 @@ class ParameterLayout:
             named += [coupling.name] if coupling.replaces else []
             if missing := [joint for joint in named if joint not in self.joints]:
                 raise SettingsError(
-                    f"coupling {coupling.name!r} has the joints {listed(missing)}, wanted joints "
+                    f"coupling {coupling.name!r} has the joints {listed(missing)}, expected joints "
                     f"that are identified: {listed(self.joints)}"
                 )
             for joint, ratio in coupling.ratios:
                 if not abs(ratio) <= LARGEST:
                     raise SettingsError(
                         f"coupling {coupling.name!r}: the ratio of joint {joint!r} is {ratio!r}, "
-                        f"wanted a number within +-{LARGEST:g} [-]"
+                        f"expected a number within +-{LARGEST:g} [-]"
                     )
             if not any(ratio for _, ratio in coupling.ratios):
                 raise SettingsError(
                     f"coupling {coupling.name!r} moves no joint: its ratios are "
-                    f"{dict(coupling.ratios)}, wanted one that is not 0; state it, for example "
+                    f"{dict(coupling.ratios)}, expected one that is not 0; state it, for example "
                     f"ratios = {{ {self.joints[0]} = 1.0 }}, or omit the coupling"
                 )
             if sum(drive.name == coupling.name for drive in self.drives) > 1:
                 raise SettingsError(
                     f"coupling {coupling.name!r} has the name of a joint or of another drive, "
-                    "wanted a unique name"
+                    "expected a unique name"
                 )
         strange = sorted(self.passive - set(self.joints))
         strange += [c.name for c in self.couplings if c.replaces and c.name in self.passive]
         if strange:
             raise SettingsError(
-                f"passive has {listed(strange)}, wanted joints that are identified and have no "
+                f"passive has {listed(strange)}, expected joints that are identified and have no "
                 f"drive: some of {listed(self.joints)}"
             )
         drives = [drive.name for drive in self.drives]
         if unknown := [name for name in self.own if name not in drives]:
             raise SettingsError(
-                f"terms are stated for {listed(unknown)}, wanted drives: {listed(drives)}"
+                f"terms are stated for {listed(unknown)}, expected drives: {listed(drives)}"
             )
         names = self.drive_names
         if len(set(names)) < len(names):
@@ -265,6 +265,6 @@ def _by_body(pi: Array | Sequence[float]) -> Array:
     values = np.asarray(pi, dtype=float)
     if values.ndim != 1 or values.size % 10:
         raise DataError(
-            f"inertial parameters have shape {values.shape}, wanted a vector of 10 per body"
+            f"inertial parameters have shape {values.shape}, expected a vector of 10 per body"
         )
     return values.reshape(-1, 10)

@@ -139,7 +139,7 @@ class Tree:
             except ValueError as error:
                 raise ModelError(
                     f"{Path(self.path).name}: the mechanicalReduction of joint {name!r} is "
-                    f"{text!r}, wanted a number"
+                    f"{text!r}, expected a number"
                 ) from error
         return found
 
@@ -199,7 +199,7 @@ def _unique(elements: list[ET.Element], kind: str, where: str) -> dict[str, ET.E
         if not name:
             raise ModelError(f"{where}: a <{kind}> has no name; give it one")
         if name in named:
-            raise ModelError(f"{where}: two {kind}s are named {name!r}, wanted unique names")
+            raise ModelError(f"{where}: two {kind}s are named {name!r}, expected unique names")
         named[name] = element
     return named
 
@@ -209,7 +209,7 @@ def _joint(element: ET.Element, links: dict[str, ET.Element], where: str) -> Joi
     at = f"{where}: joint {name!r}"
     if kind not in (*MOVABLE, "fixed"):
         raise ModelError(
-            f"{at} has type {kind!r}, wanted fixed, revolute, continuous or prismatic (for a "
+            f"{at} has type {kind!r}, expected fixed, revolute, continuous or prismatic (for a "
             "floating base use free_flyer=True, not a joint)"
         )
     ends = {}
@@ -224,7 +224,7 @@ def _joint(element: ET.Element, links: dict[str, ET.Element], where: str) -> Joi
     axis, limit = element.find("axis"), element.find("limit")
     direction = (1.0, 0.0, 0.0) if axis is None else read_numbers(axis, "xyz", f"{at}:")
     if math.hypot(*direction) < 1e-9:
-        raise ModelError(f"{at}: axis xyz is zero, wanted a direction")
+        raise ModelError(f"{at}: axis xyz is zero, expected a direction")
     keys = ("velocity", "effort") + (("lower", "upper") if kind != "continuous" else ())
     bounds = {
         key: read_numbers(limit, key, f"{at}:")[0]
@@ -246,7 +246,7 @@ def _pose(element: ET.Element, at: str) -> tuple[tuple[float, ...], tuple[float,
     """Return xyz and rpy of an element's origin."""
     origin = element.find("origin")
     if origin is not None and origin.get("quat_xyzw") is not None:
-        raise ModelError(f"{at} origin has quat_xyzw, wanted rpy; convert it to rpy angles")
+        raise ModelError(f"{at} origin has quat_xyzw, expected rpy; convert it to rpy angles")
     none = (0.0, 0.0, 0.0)
     return read_numbers(origin, "xyz", at, none), read_numbers(origin, "rpy", at, none)
 
@@ -258,14 +258,14 @@ def _root(links: tuple[str, ...], joints: tuple[Joint, ...], where: str) -> str:
     for joint in joints:
         if joint.child in moved:
             raise ModelError(
-                f"{where}: link {joint.child!r} is the child of two joints, wanted one; open the "
+                f"{where}: link {joint.child!r} is the child of two joints, expected one; open the "
                 "closed kinematic chain"
             )
         moved.add(joint.child)
         children[joint.parent].append(joint.child)
     level = roots = [link for link in links if link not in moved]
     if len(roots) != 1:
-        raise ModelError(f"{where}: the root links are {listed(roots, 9)}, wanted exactly one")
+        raise ModelError(f"{where}: the root links are {listed(roots, 9)}, expected exactly one")
     reached, depth = set(roots), 0
     while level:
         level = [child for link in level for child in children[link]]
@@ -273,7 +273,7 @@ def _root(links: tuple[str, ...], joints: tuple[Joint, ...], where: str) -> str:
         depth += 1
         if depth > _DEEPEST:
             raise ModelError(
-                f"{where}: a chain has more than {_DEEPEST} joints in series, wanted at most "
+                f"{where}: a chain has more than {_DEEPEST} joints in series, expected at most "
                 f"{_DEEPEST}"
             )
     if circle := [link for link in links if link not in reached]:
@@ -291,9 +291,9 @@ def _inertial(inertial: ET.Element, at: str) -> Inertial:
     com, rpy = _pose(inertial, at)
     (value,) = read_numbers(mass, "value", at)
     if value < 0:
-        raise ModelError(f"{at} mass is {value:g} kg, wanted more than 0; correct the sign")
+        raise ModelError(f"{at} mass is {value:g} kg, expected more than 0; correct the sign")
     if 0 < value < _LIGHTEST:
-        raise ModelError(f"{at} mass is {value:g} kg, wanted 0 or at least {_LIGHTEST:g}")
+        raise ModelError(f"{at} mass is {value:g} kg, expected 0 or at least {_LIGHTEST:g}")
     moments = tuple(read_numbers(inertia, key, at)[0] for key in MOMENTS)
     return Inertial(value, com, rpy, moments)
 
@@ -317,17 +317,17 @@ def choose_joints(
     if both:
         raise ModelError(f"joints {listed(both)} are in both joints and locked; remove them in one")
     if len(set(moving)) != len(moving):
-        raise ModelError(f"joints is {listed(moving)}, wanted each name once")
+        raise ModelError(f"joints is {listed(moving)}, expected each name once")
     if len(moving) > _MOST_JOINTS:
         raise ModelError(
-            f"{Path(tree.path).name}: {len(moving)} joints move, wanted at most {_MOST_JOINTS}; "
+            f"{Path(tree.path).name}: {len(moving)} joints move, expected at most {_MOST_JOINTS}; "
             "list the joints to identify in joints, or lock others"
         )
     for name, position in locked.items():
         is_number = isinstance(position, int | float | np.number)
         if not is_number or not abs(position) <= LARGEST:
             raise ModelError(
-                f"joint {name!r} is locked at {position!r}, wanted a number within +-{LARGEST:g} "
+                f"joint {name!r} is locked at {position!r}, expected a number within +-{LARGEST:g} "
                 "[rad or m]"
             )
     others = locked.get("*", 0.0)
@@ -371,7 +371,7 @@ def mimic_followers(tree: Tree) -> dict[str, tuple[str, float, float]]:
         while True:
             if leader not in by_name or leader in seen:
                 raise ModelError(
-                    f"joint {joint.name!r} mimics {leader!r}, wanted another movable joint that "
+                    f"joint {joint.name!r} mimics {leader!r}, expected another movable joint that "
                     "does not mimic it in turn; correct the <mimic>, or use mimic = 'independent'"
                 )
             up = by_name[leader].mimic
@@ -382,7 +382,7 @@ def mimic_followers(tree: Tree) -> dict[str, tuple[str, float, float]]:
         if not max(abs(ratio), abs(offset)) <= LARGEST:
             raise ModelError(
                 f"joint {joint.name!r} mimics {leader!r} with a total multiplier of {ratio:g} and "
-                f"offset of {offset:g}, wanted numbers within +-{LARGEST:g}; correct the <mimic>"
+                f"offset of {offset:g}, expected numbers within +-{LARGEST:g}; correct the <mimic>"
             )
         resolved[joint.name] = (leader, ratio, offset)
     return resolved
@@ -417,7 +417,7 @@ def parse_urdf(path: str | Path) -> ET.Element:
         raise ModelError(f"{_shown(str(path))} cannot be read: {error.strerror}") from error
     if size > _MOST_BYTES:
         raise ModelError(
-            f"{path.name} has {size / 2**20:.0f} MiB, wanted a URDF of at most "
+            f"{path.name} has {size / 2**20:.0f} MiB, expected a URDF of at most "
             f"{_MOST_BYTES // 2**20} MiB; move meshes and logs to separate files"
         )
     if b"<!ENTITY" in content:  # a few of them can expand beyond the memory
@@ -429,11 +429,11 @@ def parse_urdf(path: str | Path) -> ET.Element:
         robot = _parsed(content)
     except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two: its encoding
         raise ModelError(
-            f"{path.name} is not well-formed XML: {error}; wanted a URDF file"
+            f"{path.name} is not well-formed XML: {error}; expected a URDF file"
         ) from error
     if robot.tag != "robot":
         raise ModelError(
-            f"{path.name}: the top element is <{robot.tag[:LONGEST_PATH]}>, wanted <robot>"
+            f"{path.name}: the top element is <{robot.tag[:LONGEST_PATH]}>, expected <robot>"
         )
     _check_bounds(robot, path.name)
     return robot
@@ -469,7 +469,7 @@ def number_fault(element: ET.Element, key: str) -> str | None:
     kind = "finite number" if math.isinf(most) else "number"
     amount = f"one {kind}" if count == 1 else f"{count} {kind}s separated by blanks"
     bound = "" if math.isinf(most) else f" within +-{most:g}"
-    return f"{element.tag} {key} is {found}, wanted {amount}{bound}, written like 0.25 or 2.5e-1"
+    return f"{element.tag} {key} is {found}, expected {amount}{bound}, written like 0.25 or 2.5e-1"
 
 
 def read_numbers(
@@ -529,13 +529,13 @@ def _check_bounds(robot: ET.Element, where: str) -> None:
         level, depth = [child for element in level for child in element], depth + 1
         if depth > DEEPEST:
             raise ModelError(
-                f"{where}: elements are nested {depth} levels deep, wanted at most {DEEPEST}; a "
+                f"{where}: elements are nested {depth} levels deep, expected at most {DEEPEST}; a "
                 "URDF needs six"
             )
     owners = chain([robot], *(o.iter() for tag in ("link", "joint") for o in robot.iterfind(tag)))
     for element, key, text in ((x, *item) for x in owners for item in x.items()):
         if len(text) > LONGEST_PATH:
             raise ModelError(
-                f"{where}: <{element.tag[:80]}>: {key[:80]} has {len(text)} characters, wanted at "
-                f"most {LONGEST_PATH}; it starts with {_shown(text)}"
+                f"{where}: <{element.tag[:80]}>: {key[:80]} has {len(text)} characters, expected "
+                f"at most {LONGEST_PATH}; it starts with {_shown(text)}"
             )

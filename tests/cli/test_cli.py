@@ -83,11 +83,11 @@ def test_wls_result_without_a_urdf_can_be_validated(arm, arm_logs, tmp_path, cap
 
 WRONG_USE = {
     "unknown estimator": (["--estimator", "magic"], 2, "estimator is 'magic'"),
-    "bad gain": (["--gain", "elbow"], 2, "wanted JOINT=NUMBER"),
-    "bad cutoff": (["--cutoff", "no"], 2, "wanted a number or false"),
+    "bad gain": (["--gain", "elbow"], 2, "expected JOINT=NUMBER"),
+    "bad cutoff": (["--cutoff", "no"], 2, "expected a number or false"),
     "unknown joint": (["--joints", "elbow"], 1, "joint 'elbow' is not in planar_2r.urdf"),
     "cutoff beyond half the rate": (["--cutoff", "80"], 2, "not below half the rate"),
-    "unknown unit": (["--time-unit", "min"], 2, "time is 'min', wanted one of"),
+    "unknown unit": (["--time-unit", "min"], 2, "time is 'min', expected one of"),
 }
 
 

@@ -102,7 +102,7 @@ def test_the_command_refuses_by_name_and_leaves_what_was_there(tmp_path, bag, ca
     words = [str(bag), str(tmp_path / "one.csv"), "--joints", "elbow", "--topic", "/arm"]
     assert main(["convert", *words]) == 0
     assert main(["convert", str(bag), str(target), "--topic", "/arm", "--effort", "x"]) == 2
-    assert "log: effort is 'x', wanted one of" in capsys.readouterr().err
+    assert "log: effort is 'x', expected one of" in capsys.readouterr().err
     assert main(["convert", str(bag), str(tmp_path / "run.mcap"), "--topic", "/arm"]) == 1
     assert "run.mcap: logs are written as .csv, " in capsys.readouterr().err
     assert target.read_text() == "precious"

@@ -42,7 +42,7 @@ def test_a_folder_in_the_place_of_an_output_is_refused_before_the_work(
     (tmp_path / name).mkdir()
     monkeypatch.setattr("robotid.cli.identify.identify_job", None)  # is not come to
     assert main(["identify", URDF, log, "--out", str(tmp_path), "--cutoff", "5"]) == 2
-    assert f"{name}' is a folder, wanted a file to write" in capsys.readouterr().err
+    assert f"{name}' is a folder, expected a file" in capsys.readouterr().err
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()} == {
         other: content for other, content in before.items() if other != name
     }
@@ -52,7 +52,7 @@ def test_a_page_that_cannot_be_written_is_refused_before_the_work(log, tmp_path,
     assert main(["replay", "none.urdf", log, "--html", str(tmp_path)]) == 2
     assert main(["compare", "none.json", "none.json", "--out", str(tmp_path)]) == 2
     assert main(["convert", "none.csv", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.count("is a folder, wanted a file to write") == 3
+    assert capsys.readouterr().err.count("is a folder, expected a file") == 3
 
 
 def robotid(*words, **where):
@@ -96,4 +96,4 @@ def test_pipes_and_folders_are_no_input(log, tmp_path, capsys, command):
         "replay": [URDF, log, pipe],
     }
     assert main([command, *words[command]]) in (1, 2)
-    assert "is a pipe or a device, wanted a" in capsys.readouterr().err
+    assert "is a pipe or a device, expected a" in capsys.readouterr().err

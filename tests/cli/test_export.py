@@ -57,7 +57,7 @@ def test_a_result_that_must_not_be_used_is_not_exported(result, tmp_path, capsys
     (tmp_path / "bad" / "result.json").write_text(json.dumps(content | {"ranges": ranges}))
     code, _, err = export(tmp_path / "bad", "ranges", tmp_path / "a", capsys)
     assert code == 1
-    assert "result.json.ranges.robot is 3, wanted text" in err
+    assert "result.json.ranges.robot is 3, expected text" in err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bad"]
 
 

@@ -93,9 +93,9 @@ def test_a_payload_of_known_mass_is_stated_with_its_log():
     (check,) = job(identify, "--payload-check", "a=b/loaded.csv=2.5").payload_checks
     assert (check.path.name, check.mass, check.link) == ("loaded.csv", 2.5, "")
     for word in ("loaded.csv", "loaded.csv=heavy"):
-        with pytest.raises(SettingsError, match=f"--payload-check '{word}': wanted LOG=KG"):
+        with pytest.raises(SettingsError, match=f"--payload-check '{word}': expected LOG=KG"):
             job(identify, "--payload-check", word)
-    with pytest.raises(SettingsError, match=r"mass is -1.0, wanted more than 0"):
+    with pytest.raises(SettingsError, match=r"mass is -1.0, expected more than 0"):
         job(identify, "--payload-check", "loaded.csv=-1")
     with pytest.raises(SettingsError, match=r"a \[\[payload_check\]\] has no key 'mass'"):
         job_from_settings({"urdf": "x", "payload_check": [{"log": "y"}]}, "job.toml", Path())
@@ -107,7 +107,7 @@ def test_gains_are_stated_for_all_joints_or_by_joint():
     assert (found.kp, found.kd) == ({"pan": 18.0, "lift": 25.0}, 0.5)
     assert job(identify, *fit, "--kp", "18").controller.kp == 18.0
     for words in (("--kp", "stiff"), ("--kd", "pan=soft"), ("--kp", "18", "--kp", "19")):
-        with pytest.raises(SettingsError, match=rf"{words[0]} '.*': wanted (NUMBER or )?JOINT="):
+        with pytest.raises(SettingsError, match=rf"{words[0]} '.*': expected (NUMBER or )?JOINT="):
             job(identify, *fit, *words)
 
 
@@ -122,7 +122,7 @@ def test_a_job_file_takes_neither_logs_nor_flags_beside_it():
 
 @pytest.mark.parametrize(("command", "wanted"), [(identify, "URDF LOG"), (preview, "URDF MOT")])
 def test_a_command_without_a_log_names_what_it_wants(command, wanted):
-    with pytest.raises(SettingsError, match=f"no .* is given; wanted {wanted}"):
+    with pytest.raises(SettingsError, match=f"no .* is given; expected {wanted}"):
         job_from_flags(parsed(command, "robot.urdf"))
 
 

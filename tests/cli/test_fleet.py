@@ -158,13 +158,13 @@ def test_rows_state_urdf_job_and_payload(tmp_path):
          "'logs'"),
         ("unit,log,payloads\na,x,1\n", "unknown column 'payloads'. Did you mean 'payload'"),
         ("unit,log\n", "has no rows"),
-        ("unit,log\na,x\n,y\n", "row 2, column 'unit': no value, wanted the name of the robot"),
+        ("unit,log\na,x\n,y\n", "row 2, column 'unit': no value, expected the name of the robot"),
         ("unit,log,urdf\na,x,1.urdf\na,y,2.urdf\n", "row 2, column 'urdf': '2.urdf', but row 1 of "
          "the unit 'a' has '1.urdf'"),
         ("unit,log,urdf\na,x,1.urdf\na,x,1.urdf\n", "row 2, column 'log': 'x' is in row 1"),
         ("unit,log\na,x\n", "row 1, column 'urdf': the unit 'a' has no URDF"),
-        ("unit,log,payload,urdf\na,x,heavy,u\n", "row 1, column 'payload': 'heavy', wanted a mass"),
-        ("unit,log,payload,urdf\na,x,-1,u\n", "row 1, column 'payload': '-1', wanted a mass"),
+        ("unit,log,payload,urdf\na,x,heavy,u\n", "row 1, column 'payload': 'heavy', expected a"),
+        ("unit,log,payload,urdf\na,x,-1,u\n", "row 1, column 'payload': '-1', expected a mass"),
     ],
 )  # fmt: skip
 def test_a_bad_table_is_refused_with_row_column_and_value(tmp_path, text, said):

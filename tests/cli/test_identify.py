@@ -63,7 +63,7 @@ def test_files_of_an_earlier_run_do_not_stay_beside_a_new_result(arm, rng, tmp_p
 def test_a_file_in_place_of_the_folder_is_refused_before_the_fit(arm, tmp_path):
     (tmp_path / "out").write_text("")
     job = Job(Path(arm.tree.path), identification=(LogEntry(tmp_path / "none.csv"),))
-    with pytest.raises(SettingsError, match="out' is a file, wanted a folder for the results"):
+    with pytest.raises(SettingsError, match="out' is a file, expected a folder for the results"):
         run_job(job, tmp_path / "out")
 
 

@@ -153,10 +153,10 @@ def test_what_is_missing_is_named(files, capsys):
     said = asked(capsys, loaded, "--reference", files / "out", "--cutoff", "5", code=2)
     assert "a RESULT states how its logs are read; remove --cutoff" in said
     said = asked(capsys, loaded, "--reference", files / "out", "--reference", bare, code=2)
-    assert "wanted one result alone, or logs" in said
+    assert "expected one result alone, or logs" in said
     said = asked(capsys, loaded, "--reference", bare, "--mass", "heavy", code=2)
-    assert "--mass 'heavy': wanted KG or LINK=KG" in said
-    with pytest.raises(SettingsError, match=r"the link is ambiguous, wanted one of a, b"):
+    assert "--mass 'heavy': expected KG or LINK=KG" in said
+    with pytest.raises(SettingsError, match=r"the link is ambiguous, expected one of a, b"):
         stated_masses(["2"], ["a", "b"])
     content = bare.read_bytes()
     try:
@@ -214,7 +214,7 @@ def test_wrong_words_are_answered(files, capsys):
     motion = files / "bare_motion.csv"
     error = previewed(capsys, motion, "--noise", "elbow=1", code=2)
     assert "Did you mean 'elbow_joint'" in error
-    assert "wanted JOINT=NUMBER" in previewed(capsys, motion, "--noise", "elbow_joint", code=2)
+    assert "expected JOINT=NUMBER" in previewed(capsys, motion, "--noise", "elbow_joint", code=2)
     error = previewed(capsys, motion, "--given", files / "out", "--cutoff", "5", code=2)
     assert "a RESULT states how its logs are read" in error
     write_columns({"time": np.arange(9.0), "q_a": np.zeros(9)}, files / "other_robot.csv")

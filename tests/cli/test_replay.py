@@ -15,6 +15,7 @@ from helpers.replay_data import leave_out_meshes, shown
 from helpers.synthetic import exact_log, payload_log, truth
 
 from robotid.base.exceptions import DataError
+from robotid.base.files import write_json
 from robotid.cli import main
 from robotid.cli.replay import _of_joints, replay_identified
 from robotid.data.files.read import open_table, write_columns, write_log
@@ -95,6 +96,11 @@ def test_a_result_predicts_and_shows_masses_before_and_after(folder):
     assert (before["label"], after["label"]) == ("URDF", "identified")
     for body in after["bodies"]:
         assert body["mass"] == pytest.approx(value[f"{body['name']}.m"])
+    result["settings"]["validation"] = [{"log": "other.csv", "start": 3.0}, {"log": "log.csv"},
+                                        {"log": "log.csv", "start": 5.0, "end": 9.0}]  # fmt: skip
+    write_json(result, folder / "part.json")
+    _, data = run(folder, folder / "log.csv", folder / "part.json")
+    assert [(mark["t"], mark["kind"]) for mark in data["marks"]] == [(5.0, "validation")]
 
 
 def test_the_urdf_with_drives_is_rnea_and_drive_terms(identified, monkeypatch):
@@ -211,7 +217,7 @@ def test_a_base_is_where_the_log_says_or_said_to_be_held(tmp_path, capsys):
     base[:, 3:] *= 0.5
     assert play(np.column_stack([rows, base]), [*columns, *names]) is None
     assert (
-        "log.csv: the quaternion of the base has length 0.5 in row 0, wanted 1"
+        "log.csv: the quaternion of the base has length 0.5 in row 0, expected 1"
         in capsys.readouterr().err
     )
 

@@ -139,9 +139,9 @@ def test_a_motion_of_positions_alone_is_splined_and_a_recorded_one_smoothed(fold
 
 
 ERRORS = {
-    "duration is 9 s, wanted at most the 8 s of the motion": ["--duration", "9"],
+    "duration is 9 s, expected at most the 8 s of the motion": ["--duration", "9"],
     "logs are written as .csv": ["--out", "log.txt"],
-    "controller: kind is 'pid', wanted one of feedforward, pd": ["--controller", "pid"],
+    "controller: kind is 'pid', expected one of feedforward, pd": ["--controller", "pid"],
     "there is no file of a plant": ["--plant", "nowhere.toml"],
 }
 

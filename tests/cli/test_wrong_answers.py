@@ -1,12 +1,14 @@
-"""docs/evidence/wrong_answers.md: wrong answers given elsewhere without a word, provoked here."""
+"""docs/evidence/wrong_answers.csv: wrong answers given elsewhere without a word, provoked here."""
 
 import os
 import re
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
@@ -20,7 +22,9 @@ from robotid.output.files.urdf import load_identified, write_urdf
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
-DOCS = Path(__file__).parents[2] / "docs" / "evidence/wrong_answers.md"
+sys.path.append(str(ROOT / "benchmarks"))
+from write_tables import read, write
+
 URDF = example_urdf("ur5_robot.urdf")
 NOISE = np.array([2.0, 2.0, 1.0, 0.3, 0.3, 0.1])
 
@@ -271,15 +275,14 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_what_is_said_is_what_the_document_says(here, case):
-    said = here.plain(CASES[case](here)).replace("|", "/").replace("\n  ", "; ")
-    line = f"| {case} | {said} |\n"
+    said = here.plain(CASES[case](here)).replace("\n  ", "; ")
+    head, *rows = read("wrong_answers")
     if os.environ.get("ROBOTID_WRITE_DOCS"):
-        lines = DOCS.read_text().splitlines(keepends=True)
-        others = [x for x in lines if not x.startswith(f"| {case} |")]
-        DOCS.write_text("".join([*others, line]))
-    assert line in DOCS.read_text()
+        answers = dict(rows) | {case: said}
+        rows = [[name, answers.get(name, "")] for name in CASES]
+        write("wrong_answers", [head, *rows])
+    assert dict(rows)[case] == said
 
 
 def test_the_document_says_nothing_else():
-    rows = [x for x in DOCS.read_text().splitlines() if x.startswith("| ")]
-    assert [row.split(" | ")[0].removeprefix("| ") for row in rows[1:]] == list(CASES)
+    assert [case for case, _ in read("wrong_answers")[1:]] == list(CASES)

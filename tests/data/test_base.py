@@ -109,10 +109,10 @@ def test_quaternions_are_continuous_and_checked():
     np.testing.assert_allclose(np.linalg.norm(base.pose[:, 3:], axis=1), 1.0)
     pose[7, 3:] *= 1.01
     with pytest.raises(
-        DataError, match=r"quaternion of the base has length 1.01.* in row 7, wanted"
+        DataError, match=r"quaternion of the base has length 1.01.* in row 7, expected"
     ):
         BaseMotion(pose)
-    with pytest.raises(DataError, match=r"twist of the base has shape \(91, 3\), wanted \(N, 6\)"):
+    with pytest.raises(DataError, match=r"twist of the base has shape \(91, 3\), expected \(N,"):
         BaseMotion(base.pose, twist=np.zeros((91, 3)))
     pose[3, 1] = np.nan
     with pytest.raises(DataError, match="pose of the base is not finite in row 3"):
@@ -186,9 +186,9 @@ def test_a_contact_without_column_is_not_in_the_log(log, table):
 def test_a_contact_is_0_or_1():
     values = np.array([[0, 1], [1, 0], [0, 0.25], [7, 1.0]])
     wanted = BaseColumns(contacts=("a", "b"))
-    with pytest.raises(DataError, match=r"run: contact_a is 7 in row 3, wanted 0 or 1"):
+    with pytest.raises(DataError, match=r"run: contact_a is 7 in row 3, expected 0 or 1"):
         contacts_of(values, wanted, "run")
-    with pytest.raises(DataError, match=r"run: contact_b is 0.25 in row 2, wanted 0 or 1"):
+    with pytest.raises(DataError, match=r"run: contact_b is 0.25 in row 2, expected 0 or 1"):
         contacts_of(values[:3], wanted, "run")
 
 

@@ -71,23 +71,23 @@ FAULTS = [
      "t[405]; remove one of the two rows"),
     (dict(t=spoil(T, 1, T[0] - 1e-7)), "t[1] = 999.9999999 s follows t[0] = 1000.000 s"),
     (dict(t=spoil(T, 17, np.nan)), "run3.csv: time is NaN at row 17; remove the row or correct"),
-    (dict(t=T[:, None]), "run3.csv: t has shape (500, 1), wanted (N,)"),
+    (dict(t=T[:, None]), "run3.csv: t has shape (500, 1), expected (N,)"),
     *[({name: spoil(getattr(LOG, name), (34, 1), value)},
        f"run3.csv: {column}_elbow is {word} at row 34 (t = 1000.34 s); remove the row or correct")
       for name, column in (("q", "q"), ("v", "dq"), ("a", "ddq"), ("tau", "tau"))
       for value, word in ((np.nan, "NaN"), (-np.inf, "-inf"))],
     (dict(q_ref=spoil(LOG.q, (7, 1), np.nan)), "qref_elbow is NaN at row 7"),
-    (dict(q_ref=LOG.q[:, :1]), "qref has shape (500, 1), wanted (500, 2)"),
-    (dict(tau=np.zeros((500, 3))), "run3.csv: tau has shape (500, 3), wanted (500, 2): a row for "
+    (dict(q_ref=LOG.q[:, :1]), "qref has shape (500, 1), expected (500, 2)"),
+    (dict(tau=np.zeros((500, 3))), "run3.csv: tau has shape (500, 3), expected (500, 2): a row for "
      "each time stamp, a column for each of the joints shoulder, elbow"),
     (dict(contacts={"mx": ONE, "fz": np.ones((500, 2), bool)}), "'fz' of contacts has shape (500, "
-     "2), wanted (500,)"),
-    (dict(wrenches={"mx": ONE, "fz": np.zeros(499)}), "'fz' of wrenches has shape (499,), wanted"),
+     "2), expected (500,)"),
+    (dict(wrenches={"mx": ONE, "fz": np.zeros(499)}), "'fz' of wrenches has shape (499,)"),
     (dict(t=T[:1], **{x: getattr(LOG, x)[:1] for x in ("q", "v", "a", "tau")}), "run3.csv has 1 "
-     "rows, wanted at least 2; record longer"),
+     "rows, expected at least 2; record longer"),
     (dict(joints=("elbow", "elbow")), "joints contains elbow twice; name each joint once"),
-    (dict(joints="ab"), "joints is 'ab', wanted at least one name in a tuple"),
-    (dict(joints=()), "joints is (), wanted at least one name in a tuple"),
+    (dict(joints="ab"), "joints is 'ab', expected at least one name in a tuple"),
+    (dict(joints=()), "joints is (), expected at least one name in a tuple"),
     (dict(has_torque=False), "has_torque is False, but tau is not 0; leave has_torque out, or"),
     (dict(has_torque=False, tau=spoil(np.zeros((500, 2)), (3, 1), 1.0)), "but tau is not 0"),
 ]  # fmt: skip
@@ -102,16 +102,16 @@ def test_faults_of_a_log_are_named(changes, fragment):
 @pytest.mark.parametrize(
     ("changes", "fragment"),
     [
-        *[({name: np.zeros((500, 1))}, f"trajectory: {name} has shape (500, 1), wanted")
+        *[({name: np.zeros((500, 1))}, f"trajectory: {name} has shape (500, 1), expected")
           for name in ("q", "v", "a", "tau")],
         *[({name: spoil(LOG.q, (3, 0), np.nan)}, f"trajectory: {name}_shoulder is NaN at row 3")
           for name in ("q", "v", "a", "tau")],
-        ({"segment": np.zeros(500)}, "segment is float64 of shape (500,), wanted integers of"),
-        ({"segment": np.zeros(499, int)}, "segment is int64 of shape (499,), wanted integers of"),
-        *[({"rate": rate}, f"trajectory: rate is {rate}, wanted a positive number or None")
+        ({"segment": np.zeros(500)}, "segment is float64 of shape (500,), expected integers of"),
+        ({"segment": np.zeros(499, int)}, "segment is int64 of shape (499,), expected integers of"),
+        *[({"rate": rate}, f"trajectory: rate is {rate}, expected more than 0 or None")
           for rate in (0.0, -1.0, np.inf, np.nan)],
-        ({"direction": np.zeros(500)}, "trajectory: direction has shape (500,), wanted (500, c)"),
-        ({"direction": np.zeros((499, 6))}, "trajectory: direction has shape (499, 6), wanted"),
+        ({"direction": np.zeros(500)}, "trajectory: direction has shape (500,), expected (500, c)"),
+        ({"direction": np.zeros((499, 6))}, "trajectory: direction has shape (499, 6), expected"),
         ({"direction": np.full((500, 6), np.nan)}, "trajectory: direction 0 is NaN at row 0"),
     ],
 )  # fmt: skip
@@ -186,7 +186,7 @@ def test_squares_of_a_trajectory_are_of_torque_speed_and_acceleration_in_this_or
 @pytest.mark.parametrize("scale", [1e-300, 1e-12])
 def test_time_stamps_of_no_clock_are_refused(scale):
     t = scale * np.arange(5) / 100
-    with pytest.raises(DataError, match=r"5 rows lie within .* wanted at least 1e-12 s") as caught:
+    with pytest.raises(DataError, match=r"5 rows lie within .* expected at least 1e-12") as caught:
         Log(t=t, q=np.zeros((5, 1)), tau=np.zeros((5, 1)), joints=("a",))
     assert f"within {scale / 25:.3g} s, so the mean time step is {scale / 100:.3g} s" in str(
         caught.value

@@ -172,11 +172,11 @@ def test_full_turns_are_taken_out_of_free_joints_only():
 
 
 BAD = {
-    "velocity": (dict(velocity="filtered"), "velocity is 'filtered', wanted one of auto"),
-    "cutoff": (dict(cutoff=-1.0), "cutoff is -1.0, wanted 0.001 to 1e6"),
-    "rate": (dict(rate=0.0), "rate is 0.0, wanted 0.001 to 1e6"),
-    "trim": (dict(trim=-0.1), "trim is -0.1, wanted 0 or a positive number"),
-    "order": (dict(order=0), "order is 0, wanted 1 to 10"),
+    "velocity": (dict(velocity="filtered"), "velocity is 'filtered', expected one of auto"),
+    "cutoff": (dict(cutoff=-1.0), "cutoff is -1.0, expected 0.001 to 1e6"),
+    "rate": (dict(rate=0.0), "rate is 0.0, expected 0.001 to 1e6"),
+    "trim": (dict(trim=-0.1), "trim is -0.1, expected 0 or a positive number"),
+    "order": (dict(order=0), "order is 0, expected 1 to 10"),
     "NaN": (dict(cutoff=float("nan")), "cutoff is nan"),
 }
 

@@ -89,7 +89,7 @@ def test_what_is_no_sign_of_another_unit_passes(rng):
     check_units(log(q=Q * [1.0, 300.0], v=None), LogUnits(), prismatic=["b"])
     check_units(log(v=np.degrees(V)), LogUnits(), prismatic=["a", "b"])
     for name, unit, words in (("time", "min", "s, ms, us, ns"), ("angle", "grad", "rad, deg")):
-        with pytest.raises(SettingsError, match=f"{name} is '{unit}', wanted one of {words}"):
+        with pytest.raises(SettingsError, match=f"{name} is '{unit}', expected one of {words}"):
             LogUnits(**{name: unit})
 
 

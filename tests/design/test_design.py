@@ -212,7 +212,7 @@ def test_motions_begin_and_end_at_rest_and_their_derivatives_are_true(rng):
     C = rng.standard_normal((basis.size, 3))
     q, v, a = DesignedMotion(basis, C).evaluate(t)
     np.testing.assert_allclose((q, v, a), D[:3] @ C)
-    with pytest.raises(SettingsError, match="harmonics is 1, wanted 2 or more"):
+    with pytest.raises(SettingsError, match="harmonics is 1, expected 2 or more"):
         FourierBasis(5.0, 1)
 
 

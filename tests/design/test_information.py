@@ -106,7 +106,7 @@ def test_gravity_at_a_joint_is_shared_by_the_joints_of_its_chain():
     model = RobotModel.from_urdf(example_urdf("tiago_no_hand.urdf"), joints=joints)
     mapping = structural_mapping(model)
     information = MotionInformation(model, mapping, mapping.to_base(model.standard_parameters()))
-    with pytest.raises(DataError, match=rf"beta has shape \(2,\), wanted \({len(mapping.K)},\)"):
+    with pytest.raises(DataError, match=rf"beta has shape \(2,\), expected \({len(mapping.K)},\)"):
         MotionInformation(model, mapping, np.zeros(2))
     linked = {"torso": "torso arm_1 arm_2 head", "arm_1": "torso arm_1 arm_2"}
     linked |= {"arm_2": "torso arm_1 arm_2", "head": "torso head"}

@@ -84,9 +84,9 @@ def test_standard_parameters_come_back_from_base_ones(panda, rng):
     same = mapping.to_standard(mapping.to_base(prior), prior)
     np.testing.assert_allclose(same, prior, atol=1e-12)
     count = len(prior)
-    with pytest.raises(DataError, match=rf"pi has shape \({count - 1},\), wanted \({count},\)"):
+    with pytest.raises(DataError, match=rf"pi has shape \({count - 1},\), expected \({count},\)"):
         mapping.to_base(prior[1:])
-    with pytest.raises(DataError, match=rf"the problem has 1 columns, wanted the {count} of the m"):
+    with pytest.raises(DataError, match=rf"the problem has 1 columns, expected the {count} of the"):
         mapping.reduce(SimpleNamespace(names=("a",)))
 
 

@@ -197,7 +197,7 @@ def test_positions_out_of_reach_are_refused(tmp_path):
     with pytest.raises(DataError, match="no position of elbow, pivot closes") as error:
         closed_log(robot, Log(t, t[:, None], t[:, None], ("drive",)))
     _, figures = str(error.value).split(f" at t = {seconds(x)} s: ")
-    left, wanted = figures.split(" m remain, wanted at most ")
+    left, wanted = figures.split(" m remain, expected at most ")
     assert float(left) >= np.sqrt(0.15**2 + 0.6**2 - 2 * 0.15 * 0.6 * np.cos(x)) - 0.68
     assert wanted.startswith("6e-06 m")
     q = np.column_stack([t, 5.0 * t, -t])
@@ -229,7 +229,7 @@ def test_a_log_in_another_order_keeps_each_joint_and_names_the_loop_that_is_open
     with pytest.raises(DataError, match="not close the loop right_rod_end - right_heel") as error:
         closed_log(robot, log)
     gaps, allowed = Chains(robot).gaps(moved), 0.02 * robot.length
-    stated = f"{gaps[13, 1]:.3g} m remain, wanted at most {allowed:.2g} m"
+    stated = f"{gaps[13, 1]:.3g} m remain, expected at most {allowed:.2g} m"
     assert f"at t = {seconds(t[13])} s: {stated}" in str(error.value)
     assert gaps[13:, 0].max() < 1e-9
     data, ids = robot.pin_model.createData(), map(robot.pin_model.getFrameId, robot.loops[1].frames)

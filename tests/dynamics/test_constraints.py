@@ -124,7 +124,7 @@ def test_unknown_forces_have_no_effect_and_measured_ones_are_subtracted(
     motion = trajectory(quadruped, q, v, a, tau=tau, **known)
     found, used = constrained(quadruped, motion, np.ones((7, 18), dtype=bool))
     (predicted,) = predict(quadruped, [pi], found)
-    with pytest.raises(DataError, match="has contact flags of 4 contacts, wanted 3, one for each"):
+    with pytest.raises(DataError, match="has contact flags of 4 contacts, expected 3, one for"):
         constrained(quadruped, replace(motion, contacts=touching), used)
     monkeypatch.setattr("robotid.dynamics.torque.BLOCK", 3)
     W = np.vstack([rows for rows, *_ in build_problem(quadruped, found).blocks()])
@@ -273,16 +273,16 @@ def test_contacts_state_what_logs_have(quadruped):
 @pytest.mark.parametrize(
     ("contact", "message"),
     [
-        (lambda: Contact("a", "line"), "contact 'a': kind is 'line', wanted one of point, surface"),
+        (lambda: Contact("a", "line"), "'a': kind is 'line', expected one of point, surface"),
         (lambda: Contact("a", measured=("mx",)), "measured of the point contact 'a' has 'mx'"),
         (lambda: Contact("a", measured=("fx", "fx")), "some of fx, fy, fz, each once"),
-        (lambda: Contact("a", radius=-0.1), "radius is -0.1, wanted a length [m], at least 0"),
-        (lambda: Contact("a", axes="foot"), "'a': axes is 'foot', wanted one of world, link"),
-        (lambda: Contact("a", threshold="x"), "contact 'a': threshold is 'x', wanted a force [N]"),
+        (lambda: Contact("a", radius=-0.1), "radius is -0.1, expected a length [m], at least 0"),
+        (lambda: Contact("a", axes="foot"), "'a': axes is 'foot', expected one of world, link"),
+        (lambda: Contact("a", threshold="x"), "'a': threshold is 'x', expected a force [N]"),
         (lambda: Contact("a", "surface", radius=0.1), "radius of the surface contact 'a' is 0.1"),
-        (lambda: Contact("a", radius="2 cm"), "contact 'a': radius is '2 cm', wanted a length [m]"),
-        (lambda: Loop(("a", "a")), "loop has the frames a, a, wanted two links"),
-        (lambda: Loop(("a", "b"), axis=(0, 0, 0)), "is (0, 0, 0), wanted x, y, z"),
+        (lambda: Contact("a", radius="2 cm"), "'a': radius is '2 cm', expected a length [m]"),
+        (lambda: Loop(("a", "a")), "loop has the frames a, a, expected two links"),
+        (lambda: Loop(("a", "b"), axis=(0, 0, 0)), "is (0, 0, 0), expected x, y, z"),
     ],
 )
 def test_wrong_constraints_are_refused(contact, message):

@@ -74,9 +74,9 @@ def test_problems_with_other_columns_do_not_mix(rng):
         concatenate([one, other])
     with pytest.raises(DataError, match="factors differ"):
         merge([compress(one), compress(other)])
-    with pytest.raises(DataError, match="there are no factors, wanted"):
+    with pytest.raises(DataError, match="there are no factors, expected"):
         merge([])
-    with pytest.raises(DataError, match="there is no problem, wanted"):
+    with pytest.raises(DataError, match="there is no problem, expected"):
         concatenate([])
 
 

@@ -127,7 +127,7 @@ def test_the_moments_are_read_back_and_the_sentence_states_the_figures(case):
     )
     assert drive.to_dict()["error"] == drive.error
     broken = moments[ELBOW].to_dict() | {"terms": ["viscous"]}
-    with pytest.raises(DataError, match=r"shape \(6, 6\), wanted a finite matrix over the 1 terms"):
+    with pytest.raises(DataError, match=r"shape \(6, 6\), expected a finite matrix over the 1"):
         DriveMoments.from_dict(broken)
 
 

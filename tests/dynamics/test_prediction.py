@@ -108,11 +108,11 @@ def test_a_static_robot_is_predicted_by_gravity_and_the_sign_of_friction(rng):
 
 def test_instants_of_another_shape_are_refused(ur5):
     pi = ur5.standard_parameters()
-    with pytest.raises(DataError, match=r"v has shape \(5,\), wanted \(6,\), as q is \(6,\): a"):
+    with pytest.raises(DataError, match=r"v has shape \(5,\), expected \(6,\), as q is \(6,\): a"):
         predict_instants(ur5, pi, np.zeros(6), np.zeros(5))
-    with pytest.raises(DataError, match=r"q has shape \(5,\), wanted \(6,\) or \(N, 6\)"):
+    with pytest.raises(DataError, match=r"q has shape \(5,\), expected \(6,\) or \(N, 6\)"):
         predict_instants(ur5, pi, np.zeros(5), np.zeros(6))
-    with pytest.raises(DataError, match=r"q has shape \(1, 2, 6\), wanted \(6,\) or \(N, 6\)"):
+    with pytest.raises(DataError, match=r"q has shape \(1, 2, 6\), expected \(6,\) or \(N, 6\)"):
         predict_instants(ur5, pi, np.zeros((1, 2, 6)))
 
 

@@ -125,13 +125,13 @@ def test_a_problem_streams_the_regressor_in_blocks_as_often_as_wanted(ur5, rng):
 def test_a_trajectory_of_other_joints_is_refused(ur5, panda, rng):
     with pytest.raises(DataError, match="has the joints shoulder_pan_joint, shoulder_lift"):
         build_problem(panda, trajectory(ur5, rng))
-    with pytest.raises(DataError, match=r"weight has shape \(3,\), wanted \(1200, 6\)"):
+    with pytest.raises(DataError, match=r"weight has shape \(3,\), expected \(1200, 6\)"):
         build_problem(ur5, trajectory(ur5, rng), np.ones(3))
     with pytest.raises(DataError, match=r"v and a have shapes"):
         joint_torque_regressor(ur5, np.zeros((2, 6)), np.zeros((2, 5)), np.zeros((2, 6)))
     v = np.zeros((4, 6))
     v[3, 1] = np.nan
-    with pytest.raises(DataError, match=r"v\[3\] of .* is nan, wanted a finite number"):
+    with pytest.raises(DataError, match=r"v\[3\] of .* is nan, expected a finite number"):
         joint_torque_regressor(ur5, 0 * v, v, 0 * v)
 
 

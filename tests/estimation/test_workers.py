@@ -206,7 +206,7 @@ def test_workers_default_to_the_cores_for_long_work_only(tmp_path):
     assert choose_workers(short, 30) == 10
     assert choose_workers(short * 500) == available_cores()
     for wrong in (lambda: choose_workers(short, 0), lambda: WorkPlan(0)):
-        with pytest.raises(SettingsError, match="workers is 0, wanted at least 1"):
+        with pytest.raises(SettingsError, match="workers is 0, expected at least 1"):
             wrong()
 
 

@@ -134,7 +134,7 @@ def loaded(plant, rate, step=_STEP, *, as_exported=False):
     if not as_exported:
         brakes = np.array([drive.kd + drive.viscous for drive in plant.drives])
         robot.dof_armature[robot.jnt_dofadr[robot.actuator_trnid[:, 0]]] -= 0.5 * exact * brakes
-        assert (robot.dof_armature > 0).all(), "smaller steps are wanted"
+        assert (robot.dof_armature > 0).all(), "smaller steps are expected"
     return robot
 
 

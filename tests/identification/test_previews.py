@@ -180,7 +180,7 @@ def test_noise_is_stated_or_a_hundredth_of_the_largest_torque(ur5):
     with pytest.raises(SettingsError, match="Did you mean 'elbow_joint'"):
         assumed_noise(ur5, size, {"elbow": 0.7})
     for value in (-1.0, 1e160, 1e-300):
-        with pytest.raises(SettingsError, match=re.escape(f"is {value}, wanted 1e-09")):
+        with pytest.raises(SettingsError, match=re.escape(f"is {value}, expected 1e-09")):
             assumed_noise(ur5, size, {"elbow_joint": value})
     with pytest.raises(SettingsError, match="correlation is -1 s"):
         assumed_noise(ur5, size, {}, -1.0)

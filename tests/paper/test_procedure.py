@@ -234,7 +234,7 @@ def test_the_physical_arm_has_four_parameters_and_the_others_the_papers_five():
     for name in ("printed", "corrected"):
         np.testing.assert_array_equal(paper_arm(name)[1], PAPER_PARAMETERS)
     np.testing.assert_allclose(paper_arm("physical")[1], [22, 5, 3, 0.1], rtol=1e-14)
-    with pytest.raises(SettingsError, match=r"^model is 'other', wanted one of printed, corrected"):
+    with pytest.raises(SettingsError, match=r"is 'other', expected one of printed, corrected"):
         paper_arm("other")
 
 

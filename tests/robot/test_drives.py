@@ -252,7 +252,7 @@ def test_terms_of_one_drive_stand_side_by_side():
     ]  # fmt: skip
     plain = model.with_terms({})
     assert list(plain.layout.drive_names) == of_joints + shared
-    with pytest.raises(SettingsError, match="terms are stated for wrist_9, wanted drives"):
+    with pytest.raises(SettingsError, match="terms are stated for wrist_9, expected drives"):
         model.with_terms({"wrist_9": [Cubic()]})
 
 
@@ -329,7 +329,7 @@ def test_a_trajectory_without_its_memory_is_refused(rng):
         example_urdf("ur5_robot.urdf"), joints=JOINTS, own_terms={"elbow_joint": [LoadFriction()]}
     )
     x = states(rng)
-    with pytest.raises(DataError, match=r"memory has shape \(70, 0\), wanted \(70, 1\)"):
+    with pytest.raises(DataError, match=r"memory has shape \(70, 0\), expected \(70, 1\)"):
         predict(model, [truth(model)], x)
     load = drive_motion_along(model, x).load
     np.testing.assert_allclose(
@@ -340,11 +340,11 @@ def test_a_trajectory_without_its_memory_is_refused(rng):
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ({"term": "Stribek"}, "term is 'Stribek', wanted one of .*Stribeck"),
+        ({"term": "Stribek"}, "term 'Stribek' is not one of .*Stribeck"),
         ({"term": "Stribeck", "sped": 1.0}, "Stribeck has no 'sped'; it has data_range, speed"),
-        ({"term": "Stribeck", "speed": "x"}, "speed is 'x', wanted 1e-09 to 1e.09"),
-        ({"term": "Harmonic", "is_sine": 1}, "is_sine is 1, wanted true or false"),
-        ({"term": "Cubic", "data_range": [1.0]}, "data_range is .1.0,., wanted .lowest, highest."),
+        ({"term": "Stribeck", "speed": "x"}, "speed is 'x', expected 1e-09 to 1e.09"),
+        ({"term": "Harmonic", "is_sine": 1}, "is_sine is 1, expected true or false"),
+        ({"term": "Cubic", "data_range": [1.0]}, "data_range is .1.0,., expected .lowest,"),
     ],
 )
 def test_a_term_that_cannot_be_read_is_refused(table, message):
@@ -384,20 +384,20 @@ def test_what_drives_remember_is_of_the_model_not_of_what_was_remembered_before(
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: LuGre(displacement=0.1, speed=0, excess=0.5), "LuGre: speed is 0, wanted 1e-09"),
-        (lambda: LuGre(displacement=0.1, excess=-1.0), "excess is -1.0, wanted -0.99 to 1000"),
-        (lambda: Presliding(displacement=0.0), "Presliding: displacement is 0.0, wanted 1e-09 to"),
-        (lambda: Stribeck(speed=-0.1), "Stribeck: speed is -0.1, wanted 1e-09 to 1e"),
-        (lambda: Tanh(speed=1e-320), "Tanh: speed is 1e-320, wanted"),
-        (lambda: Power(exponent=1e300), r"Power: exponent is 1e\+300, wanted 0 to 10"),
-        (lambda: Harmonic(order="x"), "Harmonic: order is 'x', wanted -1e"),
-        (lambda: PositionCoulomb(order=-1), "order is -1, wanted 0 to 10"),
-        (lambda: Ramp(low=0.5, high=0.5), "Ramp: low = 0.5, high = 0.5, wanted increasing values"),
-        (lambda: Hat(before=0.0, at=0.5, after=0.2), "before = 0, at = 0.5, after = 0.2, wanted"),
-        (lambda: Counterbalance(arm=0.0), "Counterbalance: arm is 0.0, wanted 1e-09"),
+        (lambda: LuGre(displacement=0.1, speed=0, excess=0.5), "LuGre: speed is 0, expected 1e-09"),
+        (lambda: LuGre(displacement=0.1, excess=-1.0), "excess is -1.0, expected -0.99 to 1000"),
+        (lambda: Presliding(displacement=0.0), "Presliding: displacement is 0.0, expected 1e-09"),
+        (lambda: Stribeck(speed=-0.1), "Stribeck: speed is -0.1, expected 1e-09 to 1e"),
+        (lambda: Tanh(speed=1e-320), "Tanh: speed is 1e-320, expected"),
+        (lambda: Power(exponent=1e300), r"Power: exponent is 1e\+300, expected 0 to 10"),
+        (lambda: Harmonic(order="x"), "Harmonic: order is 'x', expected -1e"),
+        (lambda: PositionCoulomb(order=-1), "order is -1, expected 0 to 10"),
+        (lambda: Ramp(low=0.5, high=0.5), "Ramp: low = 0.5, high = 0.5, expected increasing"),
+        (lambda: Hat(before=0.0, at=0.5, after=0.2), "before = 0, at = 0.5, after = 0.2, expected"),
+        (lambda: Counterbalance(arm=0.0), "Counterbalance: arm is 0.0, expected 1e-09"),
         (
             lambda: Cubic(data_range=(1.0, 0.0)),
-            r"Cubic: data_range is \(1.0, 0.0\), wanted \(lowest, highest",
+            r"Cubic: data_range is \(1.0, 0.0\), expected \(lowest, highest",
         ),
         (lambda: Spring(data_range=(np.nan, 1.0)), "Spring: data_range is"),
     ],

@@ -171,8 +171,8 @@ BAD = {
         dict(joints=["elbow"], locked={"elbow": 0.0}),
         "joints elbow are in both joints and locked",
     ),
-    "unknown mimic mode": (dict(mimic="yes"), "mimic is 'yes', wanted one of independent, coupled"),
-    "gravity of two numbers": (dict(gravity=(0, 9.81)), "wanted three finite numbers"),
+    "unknown mimic mode": (dict(mimic="yes"), "'yes', expected one of independent, coupled"),
+    "gravity of two numbers": (dict(gravity=(0, 9.81)), "expected three finite numbers"),
 }
 
 
@@ -185,7 +185,7 @@ def test_a_wrong_request_names_what_is_wrong(tmp_path, options, message):
 
 FAULTS = {
     "NaN mass": ('value="2"', 'value="nan"', "link 'upper': inertial mass value is 'nan'"),
-    "negative mass": ('value="2"', 'value="-2"', "link 'upper': inertial mass is -2 kg, wanted"),
+    "negative mass": ('value="2"', 'value="-2"', "link 'upper': inertial mass is -2 kg, expected"),
     "text for a number": ('ixx="0.1"', 'ixx="0,1"', "link 'upper': inertial inertia ixx is '0,1'"),
     "two numbers in xyz": ('"0.5 0 0"', '"0.5 0"', "joint 'elbow': origin xyz is '0.5 0'"),
     "no axis": ('axis xyz="0 1 0"', 'axis xyz="0 0 0"', "axis xyz is zero"),
@@ -194,13 +194,13 @@ FAULTS = {
     "two roots": (
         '<link name="base"/>',
         '<link name="base"/><link name="x"/>',
-        "wanted exactly one",
+        "expected exactly one",
     ),
     "twice the same link": ('name="upper"', 'name="lower"', "two links are named 'lower'"),
     "no mass": ('<mass value="2"/>', "", "needs both <mass> and <inertia>"),
     "no XML": ("</robot>", "", "is not well-formed XML"),
     "unknown encoding": ("<robot", '<?xml version="1.0" encoding="klingon"?><robot', "well-formed"),
-    "not a robot": ("robot", "sdf", "the top element is <sdf>, wanted <robot>"),
+    "not a robot": ("robot", "sdf", "the top element is <sdf>, expected <robot>"),
 }
 
 
@@ -376,7 +376,7 @@ def test_a_locked_joint_is_lumped_at_its_angle(chain, kind):
 def test_a_mass_that_nothing_can_be_divided_by_is_refused(chain):
     path = chain(("revolute", ""))
     path.write_text(path.read_text().replace('mass value="1"', 'mass value="5e-324"'))
-    with pytest.raises(ModelError, match=r"mass is 4\.94066e-324 kg, wanted 0 or at least 1e-15"):
+    with pytest.raises(ModelError, match=r"mass is 4\.94066e-324 kg, expected 0 or at least 1e-15"):
         read_tree(path)
 
 
@@ -410,7 +410,7 @@ def test_gear_ratios_are_of_transmissions_with_one_joint_one_actuator_and_one_ra
     path.write_text(f"<robot name='r'><link name='base'/>{text}</robot>")
     assert read_tree(path).reductions == {"first": -80.0, "last": 0.5}
     path.write_text(path.read_text().replace("0.5<", "half<"))
-    words = "^r.urdf: the mechanicalReduction of joint 'last' is 'half', wanted a number$"
+    words = "^r.urdf: the mechanicalReduction of joint 'last' is 'half', expected a number$"
     with pytest.raises(ModelError, match=words):
         _ = read_tree(path).reductions
 
@@ -477,11 +477,11 @@ def test_blanks_around_numbers_are_read(tmp_path, text, old, new, said):
 
 
 def test_what_is_missing_is_no_zero(tmp_path):
-    with pytest.raises(ModelError, match="inertial inertia ixz is missing, wanted one number"):
+    with pytest.raises(ModelError, match="inertial inertia ixz is missing, expected one number"):
         read_tree(written(tmp_path, 'ixz="0" '))
-    with pytest.raises(ModelError, match="axis xyz is missing, wanted 3 numbers"):
+    with pytest.raises(ModelError, match="axis xyz is missing, expected 3 numbers"):
         read_tree(written(tmp_path, 'axis xyz="0 0 1"', "axis"))
-    with pytest.raises(ModelError, match="origin has quat_xyzw, wanted rpy"):
+    with pytest.raises(ModelError, match="origin has quat_xyzw, expected rpy"):
         read_tree(written(tmp_path, 'rpy="0 0 0"', 'quat_xyzw="0 0 0 1"'))
 
 
@@ -513,7 +513,7 @@ def test_rounded_angles_are_those_that_round_a_multiple_of_15_degrees():
 
 def test_files_without_end_or_bottom_are_refused_at_once(tmp_path):
     nested = written(tmp_path, "</link>", "<a>" * 1000 + "</a>" * 1000 + "</link>")
-    with pytest.raises(ModelError, match="elements are nested 41 levels deep, wanted at most 40"):
+    with pytest.raises(ModelError, match="elements are nested 41 levels deep, expected at most 40"):
         read_tree(nested)
     long = written(tmp_path, 'name="arm"', f'name="{"x" * 10_000_000}"')
     with pytest.raises(ModelError, match=r"<link>: name has 10000000 characters.*'xxx") as caught:
@@ -522,9 +522,9 @@ def test_files_without_end_or_bottom_are_refused_at_once(tmp_path):
     huge = tmp_path / "huge.urdf"
     with huge.open("wb") as stream:
         stream.truncate(2**33)
-    with pytest.raises(ModelError, match=r"huge.urdf has 8192 MiB, wanted a URDF of at most 64"):
+    with pytest.raises(ModelError, match=r"huge.urdf has 8192 MiB, expected a URDF of at most 64"):
         parse_urdf(huge)
-    with pytest.raises(ModelError, match="is a folder, wanted a URDF file"):
+    with pytest.raises(ModelError, match="is a folder, expected a URDF file"):
         parse_urdf(tmp_path)
     with pytest.raises(ModelError, match="cannot be read: File name too long"):
         parse_urdf(tmp_path / ("x" * 300))
@@ -553,15 +553,15 @@ def test_no_path_of_a_mesh_breaks_anything(tmp_path, mesh):
 
 
 DOORS = {
-    "locked at nan": (dict(locked={"elbow_joint": float("nan")}), "locked at nan, wanted a number"),
-    "locked at inf": (dict(locked={"elbow_joint": float("inf")}), "locked at inf, wanted a number"),
-    "locked too far": (dict(locked={"elbow_joint": 1e308}), "locked at 1e+308, wanted a number"),
-    "locked at text": (dict(locked={"elbow_joint": "x"}), "locked at 'x', wanted a number within"),
-    "gravity 1e308": (dict(gravity=(0, 0, 1e308)), "gravity is 0, 0, 1e+308, wanted three finite"),
-    "gravity nan": (dict(gravity=(0, float("nan"), 0)), "gravity is 0, nan, 0, wanted three"),
+    "locked at nan": (dict(locked={"elbow_joint": float("nan")}), "locked at nan, expected a"),
+    "locked at inf": (dict(locked={"elbow_joint": float("inf")}), "locked at inf, expected a"),
+    "locked too far": (dict(locked={"elbow_joint": 1e308}), "locked at 1e+308, expected a number"),
+    "locked at text": (dict(locked={"elbow_joint": "x"}), "locked at 'x', expected a number"),
+    "gravity 1e308": (dict(gravity=(0, 0, 1e308)), "gravity is 0, 0, 1e+308, expected three"),
+    "gravity nan": (dict(gravity=(0, float("nan"), 0)), "gravity is 0, nan, 0, expected three"),
     "gravity in mm": (dict(gravity=(0, 0, -9810)), "three finite numbers within +-100 [m/s^2]"),
-    "gravity of text": (dict(gravity=("a", "b", "c")), "gravity is a, b, c, wanted three finite"),
-    "no gravity": (dict(gravity=None), "gravity is None, wanted three finite"),
+    "gravity of text": (dict(gravity=("a", "b", "c")), "gravity is a, b, c, expected three finite"),
+    "no gravity": (dict(gravity=None), "gravity is None, expected three finite"),
 }  # fmt: skip
 
 
@@ -586,14 +586,14 @@ def test_a_coupling_turns_with_some_joint(ratios):
     assert "good.armature" in RobotModel.from_urdf(path, couplings=couplings).layout.names
     with pytest.raises(SettingsError, match=r"'motor' moves no joint: its ratios are \{"):
         RobotModel.from_urdf(path, couplings=[*couplings, Coupling("motor", ratios)])
-    with pytest.raises(SettingsError, match="passive has elbow_joint, wanted joints that"):
+    with pytest.raises(SettingsError, match="passive has elbow_joint, expected joints that"):
         RobotModel.from_urdf(path, couplings=[GEARED], passive=["elbow_joint"])
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('value="4.0"', 'value="4_0"', "lacks none, and has 16.99.* kg, wanted 20.99"),
+        ('value="4.0"', 'value="4_0"', "lacks none, and has 16.99.* kg, expected 20.99"),
         ('link name="wrist_3_link"', 'link name="wrist"', "cannot read it: "),
     ],
 )
@@ -618,7 +618,7 @@ def test_trees_that_are_none_or_too_deep_are_refused(tmp_path):
         RobotModel.from_urdf(long_chain(tmp_path, 2, more=circle))
     with pytest.raises(ModelError, match="a chain has more than 500 joints"):
         RobotModel.from_urdf(long_chain(tmp_path, 20_000, "fixed"))
-    with pytest.raises(ModelError, match="400 joints move, wanted at most 300; list"):
+    with pytest.raises(ModelError, match="400 joints move, expected at most 300; list"):
         RobotModel.from_urdf(long_chain(tmp_path, 400))
     assert len(RobotModel.from_urdf(long_chain(tmp_path, 400), joints=["j1", "j9"]).joints) == 2
 
@@ -636,7 +636,7 @@ def test_names_that_pinocchio_has_taken_are_refused(tmp_path, name):
 def test_a_pipe_is_no_urdf(tmp_path):
     os.mkfifo(tmp_path / "pipe.urdf")
     (finding,) = inspect_urdf(tmp_path / "pipe.urdf").findings
-    assert (finding.code, "is a pipe or a device, wanted a URDF" in finding.message) == (
+    assert (finding.code, "is a pipe or a device, expected a URDF" in finding.message) == (
         "unusable",
         True,
     )
@@ -653,7 +653,7 @@ def test_only_files_of_meshes_inside_their_package_are_read(tmp_path):
     for name in (outside, endless, "pipe.stl", "folder.stl", *nowhere):
         assert find_mesh(name, urdf) is None, name
     for name in ("r.urdf", "passwd"):
-        with pytest.raises(ValueError, match=r"is not a mesh, wanted .stl, .dae"):
+        with pytest.raises(ValueError, match=r"is not a mesh, expected .stl, .dae"):
             read_surfaces(urdf.parent / name)
     with (tmp_path / "huge.stl").open("wb") as stream:
         stream.truncate(2**40)
@@ -676,12 +676,12 @@ def test_motions_that_are_no_numbers_are_refused():
     for bad, where in (((q, 2, 8), r"q\[2, 8\]"), ((v, 1, 7), r"v\[1\] of shoulder_lift_joint")):
         values, row, column = bad
         values[row, column] = np.nan
-        with pytest.raises(DataError, match=f"{where} is nan, wanted"):
+        with pytest.raises(DataError, match=f"{where} is nan, expected"):
             joint_torque_regressor(model, q, v, np.zeros((3, 12)))
         values[row, column] = 0.0
     pi = model.standard_parameters()
     pi[12] = np.inf
-    with pytest.raises(DataError, match=r"shoulder_link.mcy is inf kg m, wanted a finite number"):
+    with pytest.raises(DataError, match=r"shoulder_link.mcy is inf kg m, expected a finite number"):
         model.with_parameters(pi)
 
 

@@ -71,7 +71,7 @@ def test_pseudo_inertia_is_pinocchios(rng):
 
 
 def test_an_incomplete_body_is_refused():
-    with pytest.raises(DataError, match=r"have shape \(13,\), wanted a vector of 10 per body"):
+    with pytest.raises(DataError, match=r"have shape \(13,\), expected a vector of 10 per body"):
         pseudo_inertia(np.zeros(13))
 
 
@@ -106,7 +106,7 @@ def test_a_coupling_may_stand_in_the_place_of_a_joints_own_drive():
     np.testing.assert_array_equal(layout.is_coupled, [True] * 3 + [False] * 5)
     with pytest.raises(SettingsError, match=r"coupling 'elbow' has the name of a joint or of"):
         replace(layout, couplings=(replace(motor, replaces=False),))
-    with pytest.raises(SettingsError, match=r"coupling 'hip' has the joints hip, wanted joints"):
+    with pytest.raises(SettingsError, match=r"coupling 'hip' has the joints hip, expected joints"):
         replace(layout, couplings=(replace(motor, name="hip"),))
 
 

@@ -216,8 +216,8 @@ def _joint_columns(
     before = entry.width - len(joints) if joints else 0
     if before not in (0, of_base):
         raise DataError(
-            f"{where}: {name} has {entry.width} columns, wanted {len(joints)}, one for each joint "
-            "that the file names" + f", or {of_base} more with a free joint" * bool(of_base)
+            f"{where}: {name} has {entry.width} columns, expected {len(joints)}, one for each "
+            "joint that the file names" + f", or {of_base} more with a free joint" * bool(of_base)
         )
     ends = joints or list(map(str, range(entry.width)))
     return {f"{kind}_{end}": (entry, before + k) for k, end in enumerate(ends)}
@@ -234,7 +234,7 @@ def _base_columns(where: str, arrays: Mapping[str, _Entry], joints: int) -> dict
     elif root:
         wanted = len((*POSE, *TWIST))
         if arrays[root].width != wanted:
-            raise DataError(f"{where}: {root} has {arrays[root].width} columns, wanted {wanted}")
+            raise DataError(f"{where}: {root} has {arrays[root].width} columns, expected {wanted}")
         names, kinds = [root], (POSE, TWIST) if root == "root_link_state_w" else (POSE,)
     else:
         return {}

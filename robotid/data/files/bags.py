@@ -201,7 +201,7 @@ def _choose_topic(bag: _Bag) -> str:
         if wanted not in types:
             fault, near = f" has no topic {wanted!r}", suggestion(wanted, types)
         elif types[wanted] not in allowed:
-            fault = f": topic {wanted!r} has messages of {types[wanted]}, wanted "
+            fault = f": topic {wanted!r} has messages of {types[wanted]}, expected "
             fault, near = fault + " or ".join(allowed), ""
         elif wanted not in filled:
             fault, near = f": topic {wanted!r} has no message", ""
@@ -392,7 +392,7 @@ def _sensors_of(bag: _Bag) -> list[_Sensor]:
         if types[topic] not in _SENSORS and not _is_low_state(types[topic]):
             raise DataError(
                 f"{where}: topic {topic!r}, which sensors states, has messages of {types[topic]}, "
-                f"wanted one of {listed([*_SENSORS, 'unitree_go/msg/LowState'])}"
+                f"expected one of {listed([*_SENSORS, 'unitree_go/msg/LowState'])}"
             )
     sensors = []
     for topic in stated or sorted(types):

@@ -385,7 +385,7 @@ class Finder:
                 )
         for joint, gain in self.gains.items():
             if not (is_number(gain) and np.isfinite(gain)) or gain == 0:
-                raise SettingsError(f"gain of {joint!r} is {gain}, wanted a number other than 0")
+                raise SettingsError(f"gain of {joint!r} is {gain}, expected a number other than 0")
         self._check_names()
         names = dict.fromkeys([*self.joints, *self.motors.values()])
         known = ["time", *(f"{kind}_{name}" for kind in KINDS for name in names)]

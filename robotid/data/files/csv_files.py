@@ -135,7 +135,7 @@ class _CsvRows(RowReader):
             hint = "; interpolate a column of another rate at the joints' stamps"
         return DataError(
             f"{self.path.name}: {name} is {repr(cell[:80]) if cell.strip() else 'empty'} at row "
-            f"{row}, wanted a number{hint}; remove the row or correct the recording"
+            f"{row}, expected a number{hint}; remove the row or correct the recording"
         )
 
 

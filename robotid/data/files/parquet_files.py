@@ -104,7 +104,7 @@ def _opened(path: Path, wanted: Sequence[str] = (), buffer: int = 0) -> Iterator
             if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
                 is_nested = pa.types.is_nested(kind)
                 remedy = "write one column per value, or their sum" if is_nested else "convert it"
-                raise DataError(f"{path.name}: {name} contains {kind}, wanted numbers; {remedy}")
+                raise DataError(f"{path.name}: {name} contains {kind}, expected numbers; {remedy}")
         yield file
 
 
@@ -141,7 +141,7 @@ def read_text_table(path: str | Path) -> tuple[list[str], list[dict[str, str]]]:
             names, rows = list(table.column_names), list(map(list, zip(*cells, strict=True)))
         case suffix:
             raise DataError(
-                f"{source.name}: the suffix is {suffix!r}, wanted a table of type .csv or "
+                f"{source.name}: the suffix is {suffix!r}, expected a table of type .csv or "
                 ".parquet; convert it"
             )
     if twice := repeated(names):
@@ -154,15 +154,15 @@ def _csv_texts(path: Path) -> tuple[list[str], list[list[str]]]:
         with path.open(encoding="utf-8-sig", newline="") as file:
             lines = [line for line in csv.reader(file, strict=True) if line]
     except (csv.Error, UnicodeDecodeError) as error:
-        raise DataError(f"{path.name} is not a CSV table: {error}; wanted UTF-8 text") from error
+        raise DataError(f"{path.name} is not a CSV table: {error}; expected UTF-8 text") from error
     if not lines:
-        raise DataError(f"{path.name} is empty, wanted a row of names and rows of values")
+        raise DataError(f"{path.name} is empty, expected a row of names and rows of values")
     names, *rows = [[cell.strip() for cell in line] for line in lines]
     for number, row in enumerate(rows, start=1):
         if len(row) != len(names):
             raise DataError(
-                f"{path.name} row {number} has {len(row)} values, wanted {len(names)}, as many as "
-                "columns; put values that contain a comma in double quotes"
+                f"{path.name} row {number} has {len(row)} values, expected {len(names)}, as many "
+                "as columns; put values that contain a comma in double quotes"
             )
     return names, rows
 
@@ -228,7 +228,7 @@ def _features(path: Path) -> dict[str, Any]:
     if not isinstance(features, dict) or not all(isinstance(x, dict) for x in features.values()):
         raise DataError(
             f"{path.name}: meta/info.json does not describe a LeRobot dataset of version 2 or "
-            f"3: features is {str(features)[:80]}, wanted a table of tables"
+            f"3: features is {str(features)[:80]}, expected a table of tables"
         )
     return features
 
@@ -257,8 +257,8 @@ def _motor_columns(path: Path, features: Mapping[str, Any]) -> dict[str, _Place]
             columns[column] = feature, place
     if not columns:
         raise DataError(
-            f"{path.name} has neither observation.state nor action, wanted one of them; features: "
-            f"{listed(features)}"
+            f"{path.name} has neither observation.state nor action, expected one of them; "
+            f"features: {listed(features)}"
         )
     return columns
 

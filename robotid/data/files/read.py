@@ -186,7 +186,7 @@ def _of_joints(log: Log, joints: Sequence[str], needs: Needs, passive: Collectio
 
 def _no_log(thing: object) -> DataError:
     return DataError(
-        f"a log is a {type(thing).__name__}, wanted a robotid.Log, the path of a file, a "
+        f"a log is a {type(thing).__name__}, expected a robotid.Log, the path of a file, a "
         "DataFrame, or a list of these; for arrays use Log(t=t, q=q, tau=tau, joints=names)"
     )
 
@@ -324,10 +324,10 @@ def lay_out(
     """Return the layout of a log in a file, before its columns are read, and its open table."""
     require_kind(needs, str, "needs", f"one of {listed(get_args(Needs))}")
     if needs not in get_args(Needs):
-        raise SettingsError(f"needs is {needs!r}, wanted one of {listed(get_args(Needs))}")
+        raise SettingsError(f"needs is {needs!r}, expected one of {listed(get_args(Needs))}")
     require_kind(joints, Sequence, "joints", "a list of at least one name")
     if isinstance(joints, str) or not joints or not all(isinstance(x, str) for x in joints):
-        raise SettingsError(f"joints is {joints!r}, wanted a list of at least one name")
+        raise SettingsError(f"joints is {joints!r}, expected a list of at least one name")
     for name, value, kinds, wanted in (
         ("columns", columns, (Mapping, type(None)), "a table of names by column"),
         ("gains", gains, (Mapping, type(None)), "a table of numbers by joint"),
@@ -395,8 +395,8 @@ def _moves(
     table: Table, units: LogUnits, prismatic: Collection[str], joint: str, column: str
 ) -> bool:
     """Return whether the position of a joint changes in its column."""
-    _, scale = units.scale(joint, is_angle=joint not in prismatic)
-    return bool(scale * np.ptp(table.read([column])[column]) > STILL)
+    values = units.scale(joint, is_angle=joint not in prismatic)[1] * table.read([column])[column]
+    return bool(len(values) and np.ptp(values) > STILL)
 
 
 def _notes_of_sensors(
@@ -466,7 +466,7 @@ def open_table(path: Path, source: LogSource) -> Table:
         if len(name) > _LONGEST_NAME:
             raise DataError(
                 f"{path.name}: a column has a name of {len(name)} characters, {name[:40]!r}..., "
-                f"wanted at most {_LONGEST_NAME}; rename it"
+                f"expected at most {_LONGEST_NAME}; rename it"
             )
     return table
 
@@ -478,7 +478,7 @@ def _format_of(path: Path) -> Format:
     suffix = path.suffix.lower()
     if path.exists() and suffix not in _READ:
         raise DataError(
-            f"{path.name}: the suffix is {suffix!r}, wanted a log file of type "
+            f"{path.name}: the suffix is {suffix!r}, expected a log file of type "
             f"{_alternatives(list(_READ))}, or the folder of a ROS 2 bag or of a LeRobot dataset; "
             "convert it"
         )

@@ -192,7 +192,7 @@ def _numbers(values: Any, name: str) -> Array:  # noqa: ANN401
     except (TypeError, ValueError) as error:
         kind = getattr(values, "dtype", type(values).__name__)
         raise DataError(
-            f"log: column {name!r} contains {kind}, wanted numbers ({error}); convert it"
+            f"log: column {name!r} contains {kind}, expected numbers ({error}); convert it"
         ) from error
 
 

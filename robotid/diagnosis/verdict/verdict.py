@@ -460,7 +460,7 @@ def check_ignored(ignore: Sequence[str]) -> None:
             hint = f". Did you mean {near[0]!r}?" if near else ""
             raise SettingsError(
                 f"doctor: ignore has the code {code!r}, which is unknown or changes no verdict; "
-                f"wanted: {listed(known)}{hint}"
+                f"expected: {listed(known)}{hint}"
             )
 
 

@@ -417,7 +417,7 @@ def why_no_solution(
     name, kp, inertia = model.joints[joints[last]], float(loops.kp[joints[last]]), M[last, last]
     return (
         f"the simulation of {name} has no solution in steps of {step:g} s: its gain kp is {kp:.3g} "
-        f"and its inertia {inertia:.3g}, wanted kp below {inertia / step**2:.3g} (inertia / "
+        f"and its inertia {inertia:.3g}, expected kp below {inertia / step**2:.3g} (inertia / "
         "step^2) and friction that opposes motion. State gains in [controller] that are closer to "
         "those of the drive, or a smaller step in [estimator]"
     )
@@ -430,13 +430,13 @@ def _wrong_friction(model: RobotModel, loops: Loops, j: int, angle: float) -> st
         is_negative = term.is_nonnegative and value < 0.0
         if is_negative or value > term.highest:
             wanted = "0 or more" if is_negative else f"at most {term.highest:g}"
-            return f"{model.joints[j]}.{term.name} is {value:.3g}, wanted {wanted}"
+            return f"{model.joints[j]}.{term.name} is {value:.3g}, expected {wanted}"
     at_rest = float(friction_at_rest(loops, j, np.array([angle]))[0])
     if at_rest >= 0.0:
         return ""
     unit, force = ("m", "N") if model.limits[j].type == "prismatic" else ("rad", "N m")
     stated = f"{at_rest:.3g} {force} at {angle:.3g} {unit}"
-    return f"its Coulomb friction is {stated}, wanted 0 or more"
+    return f"its Coulomb friction is {stated}, expected 0 or more"
 
 
 def friction_at_rest(loops: Loops, j: int, q: Array) -> Array:

@@ -52,11 +52,11 @@ class ProgramMotion(Motion):
     def __post_init__(self) -> None:
         A, T = np.asarray(self.amplitude, dtype=float), np.asarray(self.duration, dtype=float)
         if A.ndim not in (1, 2) or not np.isfinite(A).all():
-            raise DataError(f"amplitude has shape {A.shape}, wanted (n,) or (R, n), finite")
+            raise DataError(f"amplitude has shape {A.shape}, expected (n,) or (R, n), finite")
         if T.ndim > 0 and T.shape != A.shape[:-1]:
-            raise DataError(f"duration has shape {T.shape}, wanted () or {A.shape[:-1]}")
+            raise DataError(f"duration has shape {T.shape}, expected () or {A.shape[:-1]}")
         if not np.all((T > 0) & (np.inf > T)):
-            raise SettingsError(f"duration is {self.duration}, wanted a positive number")
+            raise SettingsError(f"duration is {self.duration}, expected a positive number")
 
     def evaluate(self, t: Array | float) -> tuple[Array, Array, Array]:
         """Return q, v and a as in ``Motion``, each of shape t.shape + (n,), or (R, n): t (R,)."""
@@ -79,7 +79,7 @@ class SampledMotion(Motion):
 
     def __post_init__(self) -> None:
         if len(self.t) < _ORDER + 1:
-            raise DataError(f"the motion has {len(self.t)} rows, wanted at least {_ORDER + 1}")
+            raise DataError(f"the motion has {len(self.t)} rows, expected at least {_ORDER + 1}")
 
     @property
     def duration(self) -> float:

@@ -122,7 +122,7 @@ class Actuator(Settings):
         "torque limit of each drive, relative to the URDF's effort limit; false: no limit",
         within=POSITIVE,
         **or_false(
-            "effort is true, wanted a factor of the URDF's effort limits, or false for no limits"
+            "effort is true, expected a factor of the URDF's effort limits, or false for no limits"
         ),
     )
     limits: Mapping[str, float] = setting(

@@ -144,7 +144,7 @@ def _check_size(samples: float, steps: int) -> None:
     """Refuse simulations with too many steps for an hour of computation."""
     if samples * steps > _MOST or steps > _MOST_EACH:
         raise SettingsError(
-            f"the simulation has {samples:.3g} samples of {steps} steps each, wanted at most "
+            f"the simulation has {samples:.3g} samples of {steps} steps each, expected at most "
             f"{_MOST:.0e} steps in total and {_MOST_EACH:.0e} per sample. Lower the rate or the "
             "duration (check the motion for gaps), or gains, bandwidth and stiffness"
         )
@@ -214,7 +214,7 @@ def delay(model: RobotModel, pi: Array, settings: Simulation) -> Array:
             drive = model.layout.drives[d]
             if drive in model.layout.couplings or value < 0:
                 raise SettingsError(
-                    f"{drive.name}.lag is {value:g} s, wanted 0 or more, and of a drive of one "
+                    f"{drive.name}.lag is {value:g} s, expected 0 or more, and of a drive of one "
                     "joint: a torque that several joints share has no delay of one joint"
                 )
             delays[d] += value
@@ -250,7 +250,7 @@ class RobotPlant:
     def __init__(self, model: RobotModel, pi: Array) -> None:
         model.require_fixed("simulation")
         if pi.shape != (len(model.layout.names),):
-            raise DataError(f"pi has shape {pi.shape}, wanted ({len(model.layout.names)},)")
+            raise DataError(f"pi has shape {pi.shape}, expected ({len(model.layout.names)},)")
         self.model, self.pi = model, pi
         self._bodies = model.with_parameters(pi)
         self._data = self._bodies.pin_model.createData()
@@ -609,8 +609,8 @@ def measure(
         logged = rng.random(len(logged)) >= sensors.dropped
         if logged.sum() < 2:
             raise DataError(
-                f"{logged.sum()} of {len(logged)} samples remain, wanted at least 2. Set a smaller "
-                "dropped, or a longer duration"
+                f"{logged.sum()} of {len(logged)} samples remain, expected at least 2. Set a "
+                "smaller dropped, or a longer duration"
             )
     t = run.t
     if sensors.jitter:
@@ -684,7 +684,7 @@ def perturbed_bodies(model: RobotModel, size: float, rng: np.random.Generator) -
         if values[0] < -SLACK * max(values[-1], 0.0) or values[-1] < 0:
             raise ModelError(
                 f"body {name!r} of the URDF is physically inconsistent: the smallest eigenvalue of "
-                f"its pseudo-inertia is {values[0]:.3g}, wanted 0 or more. Correct its inertial "
+                f"its pseudo-inertia is {values[0]:.3g}, expected 0 or more. Correct its inertial "
                 "(robotid inspect), or state inertials = 0 in [truth]"
             )
         root = axes * np.sqrt(np.maximum(values, 0.0)) @ axes.T
@@ -722,10 +722,10 @@ def _check(model: RobotModel, pi: Array) -> None:
         if values[0] < -SLACK * max(values[-1], 0.0):
             raise SettingsError(
                 f"truth: body {name!r} is physically inconsistent: the smallest eigenvalue of its "
-                f"pseudo-inertia is {values[0]:.3g}, wanted 0 or more. State other values, or "
+                f"pseudo-inertia is {values[0]:.3g}, expected 0 or more. State other values, or "
                 "inertials = 0.1 to draw consistent ones"
             )
     for i in np.flatnonzero(layout.is_nonnegative() & (pi < 0)):
         raise SettingsError(
-            f"truth: {layout.names[i]} is {pi[i]:g} {layout.units[i]}, wanted 0 or more"
+            f"truth: {layout.names[i]} is {pi[i]:g} {layout.units[i]}, expected 0 or more"
         )

@@ -83,7 +83,7 @@ class WLS(BatchEstimator):
                 return solution.estimate(factors.names, covariance, sigma, iteration, message)
         raise NotConvergedError(
             f"the noise levels of WLS have not converged: relative change {change:.1e} after "
-            f"{_MAX_ITERATIONS} iterations, wanted less than {_SETTLED:g}, with "
+            f"{_MAX_ITERATIONS} iterations, expected less than {_SETTLED:g}, with "
             f"{int(factors.rows.sum())} rows for {len(factors.names)} parameters; record more "
             "data, or check whether a joint has a residual of 0",
             "max_iterations",
@@ -134,7 +134,7 @@ class TLS(BatchEstimator):
             elif self.regressor_noise is not None and share >= 1.0:
                 raise DataError(
                     f"regressor_noise = {self.regressor_noise:g} corresponds to "
-                    f"{np.sqrt(share):.3g} times the actual residual, wanted less than 1; reduce "
+                    f"{np.sqrt(share):.3g} times the actual residual, expected less than 1; reduce "
                     "regressor_noise"
                 )
             before, theta = theta, mixed_tls(R, noise / np.sqrt(1.0 - share))
@@ -227,7 +227,7 @@ def mixed_tls(rows: Array, noise: Array) -> Array:
     if not is_alone or abs(v[-1]) < TINY:
         raise DataError(
             "the solution of total least squares is not unique: the smallest singular values are "
-            f"{s[-2:].tolist()}, wanted one clearly below the other; record a motion with more "
+            f"{s[-2:].tolist()}, expected one clearly below the other; record a motion with more "
             "excitation, or reduce regressor_noise"
         )
     theta = np.empty(c)

@@ -63,7 +63,7 @@ class Constraints:
         unknown = sorted(known - set(layout.bodies))
         if unknown:
             raise SettingsError(
-                f"constraints name {unknown}, which are not bodies of the model, wanted names of "
+                f"constraints name {unknown}, which are not bodies of the model, expected names of "
                 f"{listed(layout.bodies)}; links connected by fixed joints are part of the body "
                 "that a joint moves"
             )
@@ -216,13 +216,13 @@ class Consistent(BatchEstimator):
         p = len(self.layout.names)
         for name, shape in (("prior", (p,)), ("prior_std", (p,)), ("K", (len(self.K), p))):
             if getattr(self, name).shape != shape:
-                raise DataError(f"{name} has shape {getattr(self, name).shape}, wanted {shape}")
+                raise DataError(f"{name} has shape {getattr(self, name).shape}, expected {shape}")
         if not (np.isfinite(self.prior_std) & (self.prior_std > 0)).all():
             raise DataError("prior_std must be positive and finite for every parameter")
         if not np.isfinite(self.prior).all() or not np.isfinite(self._held).all():
             raise DataError("prior and held must be finite for every parameter")
         if not self.prior_weight > 0:
-            raise DataError(f"prior_weight is {self.prior_weight}, wanted a positive number")
+            raise DataError(f"prior_weight is {self.prior_weight}, expected a positive number")
         self.constraints.check(self.layout, self.prior, self._held)
 
     def _fit(self, factors: Factors) -> Estimate:
@@ -371,7 +371,7 @@ def _check_range(what: str, low: float, high: float) -> None:
             "second; write the smaller one first"
         )
     if high <= 0:
-        raise SettingsError(f"{what} is bounded by {high:g} kg, wanted a positive bound")
+        raise SettingsError(f"{what} is bounded by {high:g} kg, expected a positive bound")
 
 
 def _information_rows(estimate: Estimate, known: Array) -> Array:

@@ -174,8 +174,8 @@ def scatter(segments: Sequence[Factors], theta: Array, sigma: Array, bread: Arra
     """
     if len(segments) < FEWEST_SEGMENTS:
         raise DataError(
-            f"{len(segments)} segments are too few to estimate the scatter of their scores, wanted "
-            f"at least {FEWEST_SEGMENTS}; fit longer logs"
+            f"{len(segments)} segments are too few to estimate the scatter of their scores, "
+            f"expected at least {FEWEST_SEGMENTS}; fit longer logs"
         )
     s, c = len(segments), len(theta)
     meat, alone, along_squares, expected = np.zeros((c, c)), np.zeros((c, c)), 0.0, 0.0

@@ -276,8 +276,8 @@ class OutputError(Estimator[Simulator]):
         rows = sum(r.e.size for r in residuals)
         if rows < len(theta):
             raise DataError(
-                f"{rows} samples of position for {len(theta)} parameters, wanted at least as many "
-                "samples as parameters; record a longer motion"
+                f"{rows} samples of position for {len(theta)} parameters, expected at least as "
+                "many samples as parameters; record a longer motion"
             )
         H, g = _summed(simulator, theta, parts)
         change = np.zeros_like(theta)
@@ -361,7 +361,7 @@ def _whitened(
     for r in residuals:
         b = weights.whiten(r.e, r.joints)
         if r.slopes is None:
-            raise DataError("the simulator returned no derivatives, wanted with_slopes=True")
+            raise DataError("the simulator returned no derivatives, expected with_slopes=True")
         A = weights.whiten(r.slopes, r.joints).reshape(b.size, -1)
         b = b.reshape(-1)
         if frees:

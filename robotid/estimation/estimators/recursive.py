@@ -67,7 +67,7 @@ def scaled_rows(sample: Sample, sigma: Array, c: int) -> Array:
     if sample.Y.shape != (n, c) or sample.tau.shape != (n,) or sample.weight.shape != (n,):
         raise DataError(
             f"the sample has Y {sample.Y.shape}, tau {sample.tau.shape}, weight "
-            f"{sample.weight.shape}, wanted {(n, c)}, {(n,)}, {(n,)}"
+            f"{sample.weight.shape}, expected {(n, c)}, {(n,)}, {(n,)}"
         )
     rows = np.column_stack([sample.Y, sample.tau]) * (np.sqrt(sample.weight) / sigma)[:, None]
     if not sample.weight.all():
@@ -133,9 +133,9 @@ class RLS(Filter[RLSState]):
 
     def __post_init__(self) -> None:
         if not 0 < self.forgetting <= 1:
-            raise DataError(f"forgetting is {self.forgetting}, wanted above 0 and at most 1")
+            raise DataError(f"forgetting is {self.forgetting}, expected above 0 and at most 1")
         if not (np.isfinite(self.sigma).all() and (self.sigma > 0).all()):
-            raise DataError(f"sigma is {self.sigma}, wanted positive finite numbers")
+            raise DataError(f"sigma is {self.sigma}, expected positive finite numbers")
         if self.prior_std is not None and self.prior is None:
             raise DataError("prior_std was given without prior; state both, or neither")
         if self.forgetting < 1 and self.prior_std is None:
@@ -229,13 +229,13 @@ class Kalman(Filter[KalmanState]):
             values = getattr(self, name)
             diagonal = np.diag(values) if values.ndim == 2 else values
             if not (np.isfinite(values).all() and (diagonal > 0).all()):
-                raise DataError(f"{name} is {diagonal}, wanted positive finite numbers")
+                raise DataError(f"{name} is {diagonal}, expected positive finite numbers")
         if not np.isfinite(self.prior).all():
-            raise DataError(f"prior is {self.prior}, wanted finite numbers")
+            raise DataError(f"prior is {self.prior}, expected finite numbers")
         if not self.walk >= 0:
-            raise DataError(f"walk is {self.walk}, wanted 0 or a positive number")
+            raise DataError(f"walk is {self.walk}, expected 0 or a positive number")
         if self.gate is not None and not 0.5 <= self.gate < 1:
-            raise DataError(f"gate is {self.gate}, wanted at least 0.5 and below 1, or None")
+            raise DataError(f"gate is {self.gate}, expected at least 0.5 and below 1, or None")
 
     @property
     def weighing(self) -> Weighing:
@@ -244,8 +244,8 @@ class Kalman(Filter[KalmanState]):
     def init(self, c: int) -> KalmanState:
         if self.prior.shape != (c,) or len(self.prior_std) != c:
             raise DataError(
-                f"prior has shape {self.prior.shape} and prior_std {self.prior_std.shape}, wanted "
-                f"{c} parameters"
+                f"prior has shape {self.prior.shape} and prior_std {self.prior_std.shape}, "
+                f"expected {c} parameters"
             )
         n = len(self.sigma)
         P = self.prior_std if self.prior_std.ndim == 2 else np.diag(self.prior_std**2)

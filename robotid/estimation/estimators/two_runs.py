@@ -81,7 +81,7 @@ class TwoRuns:
         else:
             raise NotConvergedError(
                 f"the gains have not converged: relative change {np.abs(step).max():.1e} after "
-                f"{_STEPS} steps, wanted less than {_SETTLED:g}; record motions with more "
+                f"{_STEPS} steps, expected less than {_SETTLED:g}; record motions with more "
                 "excitation in both runs, or state some of the gains",
                 "max_iterations",
             )

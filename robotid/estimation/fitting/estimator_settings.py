@@ -64,11 +64,11 @@ def _interval(value: object, what: str) -> tuple[float, float]:
     """Return the bounds given by a number or by a pair of numbers."""
     pair = [value, value] if _is_number(value) else value
     if not (isinstance(pair, Sequence) and len(pair) == 2 and all(map(_is_number, pair))):
-        raise SettingsError(f"{what} is {value!r}, wanted a number or [smallest, largest] [kg]")
+        raise SettingsError(f"{what} is {value!r}, expected a number or [smallest, largest] [kg]")
     low, high = (math.inf if abs(x) > LARGEST else float(x) for x in pair)
     if not (math.isfinite(low) and math.isfinite(high)):
         raise SettingsError(
-            f"{what} is {value!r}, wanted finite numbers of at most {LARGEST:g} kg; write "
+            f"{what} is {value!r}, expected finite numbers of at most {LARGEST:g} kg; write "
             f"{LARGEST:g} for no upper bound"
         )
     if not low <= high:
@@ -88,7 +88,7 @@ def _corners(value: Any, name: str) -> tuple[list[float], list[float]]:  # noqa:
     is_box = [len(corner) for corner in corners] == [3, 3]
     if not is_box or not all(abs(x) <= LARGEST for corner in corners for x in corner):
         raise SettingsError(
-            f"com of {name} is {value!r}, wanted [[x, y, z], [x, y, z]] [m], each value at most "
+            f"com of {name} is {value!r}, expected [[x, y, z], [x, y, z]] [m], each value at most "
             f"{LARGEST:g}"
         )
     low, high = corners
@@ -120,7 +120,7 @@ class EstimatorSettings(Settings):
         if cls is not EstimatorSettings:
             return super().__new__(cls)
         if kind is None:
-            raise SettingsError(f"estimator is {name!r}, wanted one of {listed(ESTIMATORS)}")
+            raise SettingsError(f"estimator is {name!r}, expected one of {listed(ESTIMATORS)}")
         keys = [f.name for f in fields(kind) if f.name != "name"]
         keys.sort(key=lambda key: key not in kind.__annotations__)
         for key in options:
@@ -195,7 +195,7 @@ class BoundedSettings(EstimatorSettings):
         known = [f.name for f in fields(ConstraintSettings)]
         if strange := [key for key in self.constraints if key not in known]:
             raise SettingsError(
-                f"constraints has the key {strange[0]!r}, wanted keys of {listed(known)}"
+                f"constraints has the key {strange[0]!r}, expected keys of {listed(known)}"
             )
         _ = self.bounds
 
@@ -230,7 +230,7 @@ class TLSSettings(EstimatorSettings):
     name: str = _called("tls", "total least squares, which also models noise of the regressor")
     regressor_noise: float | None = setting(
         None,
-        "RMS noise of each regressor column, relative to the RMS of the column [-]; if not stated "
+        "RMS noise of each regressor column, relative to the RMS of the column [-]; default: "
         "0.01, at most half of the residual's variance",
         within=Range("x > 0", lambda x: x > 0),
     )
@@ -297,8 +297,8 @@ class SimulationSettings(EstimatorSettings):
 
     name: str = _called(
         "simulation",
-        "closed-loop output error: simulates the controlled robot from the logged commands and "
-        "fits it to the logged positions; [controller] has the known parameters of the controllers",
+        "closed-loop output error: simulates the controlled robot on the logged commands and "
+        "fits it to the logged positions; [controller] has its known parameters",
     )
     window: float | None = setting(
         None, "length of the simulated windows [s]; default 2.5, or 0.5 if the logged torque "

@@ -223,7 +223,7 @@ class Fit(Identified, Solution):
         rows, motions = np.concatenate(is_used), [e.recording.trajectory for e in self.fitted]
         for name, value in (("q", q), ("load", load)):
             if not (value is None or is_number(value)):
-                raise DataError(f"{name} is {str(value)[:60]!r}, wanted a finite number or None")
+                raise DataError(f"{name} is {str(value)[:60]!r}, expected a finite number or None")
         if v is None:
             speeds = np.abs(np.concatenate([m.v[:, -n:] for m in motions])[rows] @ ratios)
             if not speeds.any():
@@ -243,7 +243,7 @@ class Fit(Identified, Solution):
                 load = float(np.sqrt(np.mean(np.concatenate(loads)[rows] ** 2)))
         speeds = real_numbers(v, "v")
         if speeds.ndim != 1 or not np.isfinite(speeds).all():
-            raise DataError(f"v has shape {speeds.shape}, wanted finite speeds, shape (k,)")
+            raise DataError(f"v has shape {speeds.shape}, expected finite speeds, shape (k,)")
         return friction_curve(self, joint, speeds, q=q, load=load)
 
     @cached_property
@@ -380,7 +380,7 @@ class Fit(Identified, Solution):
             SettingsError: If it is another name.
         """
         if not isinstance(name, str) or name not in ("estimate", "wls"):
-            raise SettingsError(f"name is {name!r}, wanted 'estimate' or 'wls'")
+            raise SettingsError(f"name is {name!r}, expected 'estimate' or 'wls'")
         return pool(self.model, self.fitted, name)
 
     @property

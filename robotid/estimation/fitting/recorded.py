@@ -330,7 +330,7 @@ def _check_base(model: RobotModel, log: Log) -> None:
         stated = tuple(x for x in names if x in logged)  # contacts without flags are found
         if logged != (stated if kind == "contacts" else names):
             raise DataError(
-                f"{log.name} has the {kind} {listed(logged)}, wanted those of the model, "
+                f"{log.name} has the {kind} {listed(logged)}, expected those of the model, "
                 f"{listed(names)}, in this order; pass Log(..., {kind}={{...}})"
             )
 
@@ -373,7 +373,7 @@ def survey_log(
     reader, places, where = table.reader(wanted), list[Place](), Path(layout.path).name
     stamps = map_stamps(_stamps(reader, layout, places), where)
     if len(stamps) < 2:
-        raise DataError(f"{where} has {len(stamps)} rows, wanted at least 2")
+        raise DataError(f"{where} has {len(stamps)} rows, expected at least 2")
     first, stop = rows_within(stamps, where, *window)
     ranges = _close_looks(first, stop)
     columns = [reader.read(wanted, i, j, _near(places, i)) for i, j in ranges]

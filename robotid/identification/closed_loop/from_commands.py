@@ -179,7 +179,7 @@ class PositionIdentification(Identification):
     def metrics(self, name: str = "estimate") -> Metrics:
         """Return the metrics of positions over all fitted logs."""
         if name != "estimate":
-            raise SettingsError(f"name is {name!r}, wanted 'estimate'")
+            raise SettingsError(f"name is {name!r}, expected 'estimate'")
         return pool_positions(self.fitted)
 
     @cached_property

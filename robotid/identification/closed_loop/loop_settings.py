@@ -25,27 +25,27 @@ class LoopSettings(Settings):
 
     kind: str = setting(
         "pd", "input of the simulation: 'pd', a PD controller with the commands of the log; "
-        "'torque', the logged torque without a controller, where no commands are needed",
+        "'torque', the logged torque without controller and commands",
         among=("pd", "torque"),
     )  # fmt: skip
     kp: PerJoint | None = setting(
-        None, "position gain [N m/rad or N/m], for all joints or by joint; fitted if not stated, "
+        None, "position gain [N m/rad or N/m], for all joints or by joint; default: fitted, "
         "relative to gravity and inertia of the bodies", **GAIN,
     )  # fmt: skip
     kd: PerJoint | None = setting(
-        None, "speed gain [N m s/rad or N s/m], for all joints or by joint; if not stated, it is "
-        "part of the viscous friction, unless the logs have speed commands or torques", **LEVEL,
+        None, "speed gain [N m s/rad or N s/m], for all joints or by joint; default: part of the "
+        "viscous friction, or fitted if the logs have speed commands or torques", **LEVEL,
     )  # fmt: skip
     limit: PerJoint | str | None = setting(
         None,
-        "torque limit of the drive [N m or N], for all joints or by joint; if not stated, it is "
-        "fitted where the drive saturates; 'find': fitted for every joint",
+        "torque limit of the drive [N m or N], for all joints or by joint; default: fitted "
+        "where the drive saturates; 'find': fitted for every joint",
         reads=(int, float, dict, str),
         within=GAIN["within"],
         among=("find",),
     )
     delay: PerJoint | None = setting(
-        None, "delay of the command [s], for all joints or by joint; fitted if not stated", **DELAY
+        None, "delay of the command [s], for all joints or by joint; default: fitted", **DELAY
     )
     delays: str = setting(
         "one", "the fitted delays: 'one' for the robot (bus and controller), or one per 'group'",
@@ -53,14 +53,14 @@ class LoopSettings(Settings):
     )  # fmt: skip
     rate: float | None = setting(
         None, "sampling rate of a discrete-time controller, which holds its torque until the next "
-        "sample [Hz]; if not stated, the controller is in continuous time", within=_CLOCK,
+        "sample [Hz]; default: continuous time", within=_CLOCK,
     )  # fmt: skip
     gravity_compensation: bool = setting(
         False, "whether the controller adds the gravity torque of the URDF"
     )
     groups: Mapping[str, Sequence[str]] = setting(
         {}, "joints with equal drives, by name of the group; they share gains, armature and "
-        "viscous friction. If not stated, joints that are equal in the URDF form a group",
+        "viscous friction; default: joints that are equal in the URDF form a group",
         reads=Entries(dict, (list,)),
     )  # fmt: skip
     zeros: str = setting(
@@ -90,7 +90,7 @@ def groups_of(settings: LoopSettings, joints: Sequence[str], alike: Sequence[Any
     for group, members in settings.groups.items():
         if isinstance(members, str) or not isinstance(members, Sequence):
             raise SettingsError(
-                f"controller: groups.{group} is {members!r}, wanted a list of joints"
+                f"controller: groups.{group} is {members!r}, expected a list of joints"
             )
         for joint in members:
             if joint not in joints:

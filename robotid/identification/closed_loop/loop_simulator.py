@@ -600,7 +600,7 @@ def impossible(simulator: LoopSimulator, theta: Array, tried: Sequence[Tried]) -
         if (least := float(friction.min())) < 0.0:
             at = float(q[np.argmin(friction)])
             unit, force = ("m", "N") if t.joint in model.layout.prismatic else ("rad", "N m")
-            why[t] = f"the friction at {at:.3g} {unit} is {least:.2g} {force}, wanted 0 or more"
+            why[t] = f"the friction at {at:.3g} {unit} is {least:.2g} {force}, expected 0 or more"
     return why
 
 

@@ -519,8 +519,8 @@ def _check_logs(logs: Sequence[Log], loop: LoopSettings, settings: SimulationSet
     if loop.kind != "torque" and not any(np.ptp(x, axis=0).any() for x in commands):
         raise DataError(
             f"{listed(sorted({log.name for log in logs}))}: the commands of all joints are "
-            "constant, wanted commands that move at least one joint. Record a motion, or check the "
-            "columns of the commands"
+            "constant, expected commands that move at least one joint. Record a motion, or check "
+            "the columns of the commands"
         )
     for log in logs if settings.velocities else ():
         if log.v is None or not is_trustworthy(log):

@@ -57,7 +57,7 @@ def isaac_actuators(
 ) -> dict[str, Any]:
     """Return the groups of joints with equal drives, with the names of Isaac Lab's fields."""
     if not 0 < physics_dt < math.inf:
-        raise SettingsError(f"step is {physics_dt:g} s, wanted a positive time")
+        raise SettingsError(f"step is {physics_dt:g} s, expected a positive time")
     if not commanded:
         raise DataError(
             "the result has no gains of drives, which Isaac Lab's actuators require; identify from "

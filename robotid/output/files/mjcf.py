@@ -165,9 +165,9 @@ def write_mjcf(
     """
     require_kind(step, (float, int), "step", "a time [s]")
     if not 0 < step < np.inf:
-        raise SettingsError(f"step is {step:g} s, wanted a positive time")
+        raise SettingsError(f"step is {step:g} s, expected a positive time")
     if delay not in DELAYS:
-        raise SettingsError(f"delay is {delay!r}, wanted one of {listed(DELAYS)}")
+        raise SettingsError(f"delay is {delay!r}, expected one of {listed(DELAYS)}")
     require_each(commanded, CommandedDrive, "commanded", "a list of drives")
     to = XmlFormat("MJCF", _TERMS, True, _is_readable)
     servos = _Servos({drive.joint: drive for drive in commanded}, step, delay)

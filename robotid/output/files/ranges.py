@@ -224,9 +224,9 @@ def covariance_entry(names: Sequence[str], covariance: Array, is_fixed: Array) -
 def write_samples(result: Result, target: Path, count: int, seed: int) -> None:
     """Write samples of the parameters of a result as JSON."""
     if not 1 <= count <= _MOST:
-        raise SettingsError(f"samples is {count}, wanted a whole number from 1 to {_MOST}")
+        raise SettingsError(f"samples is {count}, expected a whole number from 1 to {_MOST}")
     if seed < 0:
-        raise SettingsError(f"seed is {seed}, wanted a whole number, 0 or more")
+        raise SettingsError(f"seed is {seed}, expected a whole number, 0 or more")
     names, values = sample(result, count, np.random.default_rng(seed))
     model, pi = result.identified
     units = {entry["name"]: entry["unit"] for entry in result.content["drive_parameters"]}

@@ -81,7 +81,7 @@ def commanded_drives(
         ):
             if not is_right:
                 value = stated[f"{joint}.{term}"]
-                raise DataError(f"{name}: {joint}.{term} is {value:g}, wanted {wanted}")
+                raise DataError(f"{name}: {joint}.{term} is {value:g}, expected {wanted}")
     controller = content.get("simulation", {}).get("controller", {})
     efforts = controller.get("effort_limit") or {}
     found = dict(zip(model.layout.names, pi.tolist(), strict=True))
@@ -203,7 +203,7 @@ class Result:
 
         if "simulation" not in self.content:
             raise DataError(
-                f"{self.path.name} is a result from torques, wanted one of the estimator "
+                f"{self.path.name} is a result from torques, expected one of the estimator "
                 "'simulation'; use predict(q, v, a)"
             )
         (model, pi), drives = self.identified, self.commanded
@@ -317,7 +317,7 @@ def read_result(path: str | Path) -> dict[str, Any]:
     version = result.get("schema_version") if isinstance(result, dict) else None
     if version != SCHEMA_VERSION or "verdict" not in result:
         raise DataError(
-            f"{name} has schema_version {version!r}, wanted {SCHEMA_VERSION} of a result "
+            f"{name} has schema_version {version!r}, expected {SCHEMA_VERSION} of a result "
             "written by 'robotid identify'"
         )
     check_shape(result, schema("result"), name)

@@ -54,17 +54,17 @@ def check_shape(value: Any, wanted: Any, at: str) -> None:  # noqa: ANN401
             check_shape(entry, wanted[0], f"{at}[{k}]")
     elif wanted == "file":
         if not isinstance(value, str) or Path(value).name != value or "\0" in value:
-            raise DataError(f"{at} is {shown(value)}, wanted the name of a file in the same folder")
+            raise DataError(f"{at} is {shown(value)}, expected a file name in the same folder")
     elif wanted in _KINDS:
         _check_kind(value, wanted, at)
     elif value not in wanted.split(", "):
-        raise DataError(f"{at} is {shown(value)}, wanted one of {wanted}")
+        raise DataError(f"{at} is {shown(value)}, expected one of {wanted}")
 
 
 def require_lengths(value: Any, shape: Sequence[int], at: str) -> None:  # noqa: ANN401
     """Refuse nested lists of other lengths."""
     if shape and len(value) != shape[0]:
-        raise DataError(f"{at} has {len(value)} entries, wanted {shape[0]}")
+        raise DataError(f"{at} has {len(value)} entries, expected {shape[0]}")
     for k, entry in enumerate(value if shape[1:] else ()):
         require_lengths(entry, shape[1:], f"{at}[{k}]")
 
@@ -72,6 +72,6 @@ def require_lengths(value: Any, shape: Sequence[int], at: str) -> None:  # noqa:
 def _check_kind(value: object, kind: str, at: str) -> None:
     kinds = _KINDS[kind]
     if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
-        raise DataError(f"{at} is {shown(value)}, wanted {_WORDS.get(kind, kind)}")
+        raise DataError(f"{at} is {shown(value)}, expected {_WORDS.get(kind, kind)}")
     if isinstance(value, int | float) and abs(value) > _LARGEST:
-        raise DataError(f"{at} is {shown(value)}, wanted a number of at most {_LARGEST:g}")
+        raise DataError(f"{at} is {shown(value)}, expected a number of at most {_LARGEST:g}")

@@ -101,7 +101,7 @@ def read_sidecar(path: str | Path) -> dict[str, Any]:
     version = content.get("schema_version") if isinstance(content, dict) else None
     if version != _SCHEMA_VERSION:
         raise DataError(
-            f"{source.name} has schema_version {version!r}, wanted {_SCHEMA_VERSION} of a drive "
+            f"{source.name} has schema_version {version!r}, expected {_SCHEMA_VERSION} of a drive "
             "parameters file written by robotid"
         )
     check_shape(content, schema("sidecar"), source.name)
@@ -117,7 +117,7 @@ def load_identified(urdf: str | Path, sidecar: str | Path) -> tuple[RobotModel, 
     if found != facts["urdf_sha256"]:
         raise ModelError(
             f"{path.name} has changed since {Path(sidecar).name} was written: its SHA-256 starts "
-            f"with {found[:12]}, wanted {facts['urdf_sha256'][:12]}; restore the file, or write "
+            f"with {found[:12]}, expected {facts['urdf_sha256'][:12]}; restore the file, or write "
             "both again"
         )
     couplings = [
@@ -186,7 +186,7 @@ def _drive_value(drives: Mapping[str, Any], name: str, where: str) -> float:
     entry = drives.get(owner)
     value = entry.get(term) if isinstance(entry, dict) else None
     if not isinstance(value, int | float) or not math.isfinite(value):
-        raise DataError(f"{where}: {name} is {value!r}, wanted a finite number")
+        raise DataError(f"{where}: {name} is {value!r}, expected a finite number")
     return float(value)
 
 
@@ -195,10 +195,10 @@ def _check_parameters(model: RobotModel, pi: Array) -> None:
     wanted = (len(model.layout.names),)
     require_kind(pi, np.ndarray, "pi", f"an array of shape {wanted}")
     if pi.shape != wanted:
-        raise DataError(f"pi has shape {pi.shape}, wanted {wanted}")
+        raise DataError(f"pi has shape {pi.shape}, expected {wanted}")
     for name, value in zip(model.layout.names, pi, strict=True):
         if not math.isfinite(value):
-            raise DataError(f"{name} is {value}, wanted a finite number")
+            raise DataError(f"{name} is {value}, expected a finite number")
 
 
 def _check_target(source: Path, target: Path) -> None:
@@ -207,7 +207,7 @@ def _check_target(source: Path, target: Path) -> None:
     if not target.parent.is_dir():
         raise ModelError(f"the folder {str(target.parent)!r} does not exist; create it")
     if target.is_dir():
-        raise ModelError(f"the target {str(target)!r} is a folder, wanted a file")
+        raise ModelError(f"the target {str(target)!r} is a folder, expected a file")
     if target.exists() and target.samefile(source):
         raise ModelError(f"the target {str(target)!r} is the original URDF; choose another name")
 
@@ -233,11 +233,11 @@ def link_parameters(model: RobotModel, pi: Array) -> dict[str, Array]:
             )
         raise ModelError(
             f"link {layout.bodies[k]!r}{others} would be physically impossible: the smallest "
-            f"eigenvalue of its pseudo-inertia is {least[0][k]:.3g}, wanted > 0; {todo}"
+            f"eigenvalue of its pseudo-inertia is {least[0][k]:.3g}, expected > 0; {todo}"
         )
     for i in np.flatnonzero(layout.is_nonnegative() & (pi < 0)):
         raise ModelError(
-            f"{layout.names[i]} is {pi[i]:.3g} {layout.units[i]}, wanted 0 or more; {advice}"
+            f"{layout.names[i]} is {pi[i]:.3g} {layout.units[i]}, expected 0 or more; {advice}"
         )
     return dict(zip(layout.bodies, moving.reshape(-1, 10), strict=True))
 

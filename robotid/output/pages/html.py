@@ -28,6 +28,7 @@ _STYLE = "main { padding: .5rem 1rem; } h1 { font-size: 1.125rem; margin: 0 0 .5
 _FIRST = 3  # reasons of a verdict that are visible without unfolding
 _KINDS = {"urdf": "URDF", "sidecar": "drive parameters"}  # of files, by key of result.json
 _DOCK = '<div id="replay" class="dock"'
+_FOLDERS = re.compile(r"^((?:&#x27;)?(?:\w:)?[/\\].*[/\\])")  # of an absolute path
 #: Scripts, and the pattern of pages that need them.
 _SCRIPTS = {
     "page.js": '<details|<table class="data"', "tables.js": '<table class="data"', "dock.js": _DOCK,
@@ -203,10 +204,14 @@ def facts_html(facts: Mapping[str, str], files: Mapping[str, str] | None = None)
 
 
 def command_html(block: str) -> str:
-    """Return the HTML of a command, or of lines of a job file; lines break between arguments."""
+    """Return the HTML of a command, or of lines of a job file; lines break between arguments.
+
+    Folders of absolute paths are not visible, but are copied.
+    """
     html = escape(block)
     if block.startswith("robotid ") and "\n" not in block:  # an argument does not end at a hyphen
-        html = " ".join(f"<span>{escape(argument)}</span>" for argument in arguments(block))
+        words = [_FOLDERS.sub(r"<i>\1</i>", escape(word)) for word in arguments(block)]
+        html = " ".join(f"<span>{word}</span>" for word in words)
     return f'<pre class="command">{html}</pre>'
 
 

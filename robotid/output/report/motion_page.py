@@ -35,9 +35,9 @@ _COLUMNS = (
     ("unit", "text", "unit"),
 )  # fmt: skip
 _UNCHECKED = {
-    "unread": "Not checked, since no shape can be read",
-    "left_alone": "Not checked, since in contact by design",
-    "built_near": "Close by design, with a smaller clearance",
+    "unread": "Not checked, because no shape of these links can be read",
+    "left_alone": "Not checked, because these links touch by design",
+    "built_near": "These links are close by design; half of their median distance is their clearance",
 }
 _NAMED = 5  # base parameters with the largest expected standard errors that are named
 _SHARP = 0.1  # share of the plausible range below which one is well determined ...
@@ -133,7 +133,7 @@ def _over_time(model: RobotModel, content: Mapping[str, Any], course: Course) ->
             series = (*edges, *_lines(model, 100.0 * course.used[k], joints))
             title = f"{kind} of each joint relative to its limit"
             chart = Chart(title, course.t, series, "time [s]", "% of the limit", "time")
-            charts.append(chart_html(chart, f"{kind.capitalize()}, % of the limit"))
+            charts.append(chart_html(chart, kind.capitalize()))
         if len(free) and kind in ("acceleration", "torque"):
             prismatic = [model.joints[j] in model.layout.prismatic for j in free]
             units = [_UNITS[k]] * (not all(prismatic)) + [_PRISMATIC[k]] * any(prismatic)

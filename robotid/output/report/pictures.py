@@ -197,7 +197,8 @@ def why_charts(torque: JointTorque, *, link: str = "time") -> dict[str, Chart]:
 
 
 def _split(torque: JointTorque, link: str) -> Chart:
-    k = _first(torque)
+    rows = np.flatnonzero(torque.rows.recording == 0)
+    k = rows[spread_rows(len(rows), _POINTS)]
     parts = {name: torque.parts[name][k] for name in torque.present}
     values = [*parts.values(), torque.residual[k], torque.tau[k]]
     t, *values = broken(torque.rows.segment[k], torque.rows.t[k], *values)
@@ -227,8 +228,3 @@ def _residual(torque: JointTorque, dependence: Dependence, link: str) -> Chart:
         f"{what} against {name}, with its mean and 95 % interval", x[k], series,
         f"{name} [{unit}]", f"residual [{torque.unit}]", link if is_one else "", height=120,
     )  # fmt: skip
-
-
-def _first(torque: JointTorque) -> Array:
-    rows = np.flatnonzero(torque.rows.recording == 0)
-    return rows[spread_rows(len(rows), _POINTS)]

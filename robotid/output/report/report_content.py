@@ -29,7 +29,7 @@ from robotid.identification.closed_loop.position_errors import (
     pool_positions,
 )
 from robotid.identification.result import Identification, TorqueIdentification
-from robotid.identification.summary import left_out_lines, verdict_cell
+from robotid.identification.summary import left_out_lines
 from robotid.output.files.entries import loop_parameters
 from robotid.output.pages.html import (
     POINTS,
@@ -112,7 +112,7 @@ def page_of(found: Identification, report: Report, origin: Origin, files: Mappin
             False,
         ),
         "findings": Section("Findings", findings, tally(serious, notes, worst) or "none", False),
-        "friction": Section("Friction against speed", report.friction),
+        "friction": Section("Friction against speed", report.friction, "of each joint", False),
         "curves": Section(*report.curves),
         "why": Section("Residual analysis", report.why, "torque components of each joint", False),
         "variation": Section("Variation between logs", report.variation, "", False),
@@ -206,7 +206,7 @@ class Dock:
 
     def _command(self, clip: Clip) -> str:
         words = self.origin.using("replay", self.urdf, clip.log, self.origin.folder)
-        return "".join(words) if clip.log else ""
+        return "".join(map(command_html, words)) if clip.log else ""
 
     def link(self, words: str, start: float, joint: str, log: str) -> str:
         """Return the HTML of a link to a time of the replay; "" without replay."""
@@ -231,7 +231,7 @@ class Dock:
         kind, command = "written", ""
         if not self.replay:
             kind = "unwritten"
-            command = command_html(next(filter(None, map(self._command, self.clips))))
+            command = next(filter(None, map(self._command, self.clips)))
         file, packed = escape(quote(self.file)), escape(json.dumps(clips))
         return block(f"report.{kind}_dock", file=file, clips=packed, command=command)
 
@@ -334,7 +334,7 @@ def curves_section(
     if left := [e.name for e in evaluations[len(shown) :]]:
         parts.append(block("report.not_drawn", names=escape(", ".join(left))))
     for row, name in enumerate(rows):
-        status = verdict_cell(name, verdicts[name]) if name in verdicts else ""
+        status = verdicts[name]["status"] if name in verdicts else ""
         unit = f"{quantity.prefix}{units[row]}"
         note = worst_html(worst_second(residuals(row)), name, unit, player, quantity.scale)
         html = note + "".join(charts(e, row, link, points) for link, e in runs.items())

@@ -32,7 +32,8 @@ from robotid.output.pages.html import (
 from robotid.robot.parameters import INERTIAL_TERMS, pseudo_inertia
 
 VISIBLE = 10  # joints that are visible without unfolding
-_END = 150.0  # [%] end of the scale; larger errors end there, too
+_END = 100  # [%] end of the linear axis of the bars; larger errors end there, too
+_TICKS = range(0, _END + 1, 20)  # [%]
 _COLUMNS = (
     ("joint", "code", "joint"), ("error %", "%", "relative_error_pct"),
     ("verdict", "text", "verdict"), ("RMSE", ".3g", "rmse"), ("unit", "text", "unit"),
@@ -41,17 +42,11 @@ _COLUMNS = (
 _UNKNOWN = {"status": "not evaluated", "reasons": ()}
 
 
-class Mark(NamedTuple):
-    """Marker of another prediction: its name, its SVG path about (0, 9), "fill" or "line"."""
+class Baseline(NamedTuple):
+    """Another prediction: its name, and the colour of its bar, a variable of tones.css."""
 
     words: str
-    path: str
-    style: str
-
-    @property
-    def svg(self) -> str:
-        """The path in the style."""
-        return f'<path class="{self.style}" d="{self.path}"/>'
+    tone: str
 
 
 @dataclass(frozen=True)
@@ -61,7 +56,7 @@ class Quantity:
     title: str  # name of its error
     share: str  # definition of the error, as a formula
     limits: tuple[float, float]  # largest error that is good, and largest that is usable [%]
-    marks: Mapping[str, Mark]  # markers of the baselines, by name
+    baselines: Mapping[str, Baseline]
     scale: float = 1.0  # unit of the errors shown, in units of the quantity
     prefix: str = ""  # prefix of that unit
 
@@ -71,10 +66,10 @@ TORQUE = Quantity(
     "100 |τ − prediction| / |τ|",
     (GOOD, POOR),
     {
-        "wls": Mark("WLS", "M-5 -1h10l-5 6z", "fill"),
-        "urdf_with_drives": Mark("URDF + drives", "M-5 19h10l-5 -6z", "fill"),
-        "gravity_only": Mark("gravity only", "M-3 6l6 6m0 -6l-6 6", "line"),
-        "urdf": Mark("URDF", "M0 0v18", "line"),
+        "wls": Baseline("WLS", "tone-7"),
+        "urdf_with_drives": Baseline("URDF + drives", "tone-3"),
+        "urdf": Baseline("URDF", "urdf"),
+        "gravity_only": Baseline("gravity only", "quiet"),
     },
 )
 POSITION = Quantity(
@@ -82,11 +77,11 @@ POSITION = Quantity(
     "100 |q − simulated| / |motion|",
     (GOOD_POSITION, POOR_POSITION),
     {
-        "second_order": Mark("2nd-order model", "M-5 -1h10l-5 6z", "fill"),
-        "rows": Mark("torque fit", "M-5 19h10l-5 -6z", "fill"),
-        "urdf": Mark("URDF", "M0 0v18", "line"),
-        "command": Mark("command", "M-3 6l6 6m0 -6l-6 6", "line"),
-        "steady": Mark("constant speed", "M-3 9h6", "line"),
+        "second_order": Baseline("2nd-order model", "tone-7"),
+        "rows": Baseline("torque fit", "tone-3"),
+        "urdf": Baseline("URDF", "urdf"),
+        "command": Baseline("command", "tone-5"),
+        "steady": Baseline("constant speed", "quiet"),
     },
     scale=1e-3,
     prefix="m",
@@ -155,12 +150,14 @@ def error_bars(
     # the only validation recording need not be named
     is_alone = len(recordings) == 1 and not recordings[0].is_fitted
     alone = f" on {recordings[0].name}" if is_alone else ""
-    items = []
+    items, said = list[str](), set[str]()
     for joint in [*worst, *(joint for joint in verdicts if joint not in worst)]:
         verdict, row, link, picture = verdicts.get(joint, _UNKNOWN), rows.index(joint), "", ""
         status = verdict["status"]
         reasons = [reason.replace(alone, "") for reason in verdict["reasons"]]
-        why = joint_reason(joint, reasons[-1:] if status == "good" else reasons)
+        shown = reasons if status != "good" else [] if items else reasons[-1:]
+        why = joint_reason(joint, shown)
+        why, said = "as above" if why and why in said else why, said | {why}
         error = _share(worst[joint]) if joint in worst else None
         if error is not None:
             picture = _picture(quantity, row, joint, error, worst[joint])
@@ -189,45 +186,40 @@ def error_bars(
 
 
 def _others(quantity: Quantity, measured: Mapping[str, Any]) -> dict[str, float]:
-    errors = {key: measured.get(f"{key}_relative_error_pct") for key in quantity.marks}
+    errors = {key: measured.get(f"{key}_relative_error_pct") for key in quantity.baselines}
     return {key: error for key, error in errors.items() if error is not None}
 
 
 def _at(value: float) -> str:
-    """Return the position of an error on the square-root scale."""
-    return f"{100 * (min(value, _END) / _END) ** 0.5:.2f}%"
+    """Return the position of an error on the axis."""
+    return f"{100 * min(value / _END, 1.0):.2f}%"
 
 
 def _picture(
     quantity: Quantity, row: int, joint: str, error: float, measured: Mapping[str, Any]
 ) -> str:
     others, words = "", []
-    for key, value in _others(quantity, measured).items():
-        mark = quantity.marks[key]
-        others += f'<svg x="{_at(value)}" overflow="visible" aria-hidden="true">{mark.svg}</svg>'
-        words.append(f"{mark.words} {percent(value).html} %")
+    for k, (key, value) in enumerate(_others(quantity, measured).items()):
+        baseline = quantity.baselines[key]
+        style = f'y="{10 + 4 * k}" height="3" style="--tone: var(--{baseline.tone})"'
+        others += f'<rect width="{_at(value)}" {style}/>'
+        words.append(f"{baseline.words} {percent(value).html} %")
     places = map(_at, quantity.limits)
-    lines = "".join(f'<line x1="{x}" x2="{x}" y1="-2" y2="18"/>' for x in places)
+    lines = "".join(f'<line x1="{x}" x2="{x}" y1="0" y2="100%"/>' for x in places)
     title = escape(f"{joint}: error {percent(error).html} %; for comparison {', '.join(words)}")
     figures = {"lines": lines, "width": _at(error), "others": others}
-    return block("report.picture", row=row, title=title, **figures)
+    return block("report.picture", row=row, title=title, height=10 + 4 * len(words), **figures)
 
 
 def _legend(quantity: Quantity, known: set[str]) -> str:
     keys = "".join(
-        f'<span><svg width="10" height="18" viewBox="-5 0 10 18" aria-hidden="true">{mark.svg}'
-        f"</svg>{mark.words}</span>"
-        for key, mark in quantity.marks.items()
+        f'<span><i style="--tone: var(--{baseline.tone})"></i>{baseline.words}</span>'
+        for key, baseline in quantity.baselines.items()
         if key in known
     )
-    good, poor = quantity.limits
-    names = {good: f"{good:g} good", poor: f"{poor:g} usable", 100.0: "100", _END: "150 %"}
-    ticks = sorted({1.0, 5.0, *names})
-    scale = "".join(f'<span style="left: {_at(x)}">{names.get(x, f"{x:g}")}</span>' for x in ticks)
-    return (
-        f'<p class="legend">{keys}</p>\n<div class="scale" aria-hidden="true"><div>{scale}</div>'
-        "</div>\n"
-    )
+    ticks = "".join(f'<span style="left: {_at(x)}">{x}</span>' for x in _TICKS)
+    good, usable = (f"{limit:g}" for limit in quantity.limits)
+    return block("report.legend", keys=keys, ticks=ticks, good=good, usable=usable)
 
 
 def error_table(
@@ -237,7 +229,7 @@ def error_table(
     verdicts: Mapping[str, Mapping[str, Any]],
 ) -> str:
     """Return the table of the errors on a recording."""
-    others = {f"{key}_relative_error_pct": mark.words for key, mark in quantity.marks.items()}
+    others = {f"{key}_relative_error_pct": x.words for key, x in quantity.baselines.items()}
     known = [key for key in others if any(m.get(key) is not None for m in errors.joints.values())]
     entries = []
     for joint in rows:
@@ -398,7 +390,8 @@ def body_table(identification: TorqueIdentification) -> str:
         for value, half, urdf in zip(*parts, strict=True):
             identified = both(value, half)
             prior = with_error(urdf, half)[0].html
-            html = f'{identified.html}<br><span class="note">{prior}</span>'
+            lines = identified.html.replace(" ± ", "<br>± ")
+            html = f'{lines}<br><span class="note">{prior}</span>'
             cells.append(Cell(html, "number", identified.value))
         rows.append([code(body), *cells])
     units = zip(CENTRAL_TERMS, _CENTRAL_UNITS, strict=True)

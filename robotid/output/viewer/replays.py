@@ -422,7 +422,7 @@ class Mark:
 
     t: float  # on the clock of the motion [s]
     label: str
-    kind: str = "note"  # "payload", "gap" or "note"
+    kind: str = "note"  # "payload", "gap", "note", or "validation", at which the page starts
     joint: str = ""  # the affected joint, if any
 
 
@@ -505,7 +505,7 @@ def replay(
     for label, path in others.items():
         require_each([label], str, "the label of a ghost", "text")
         if len(require_each(path, np.ndarray, f"ghost {label!r}", "two arrays, t and q")) != 2:
-            raise SettingsError(f"ghost {label!r} has {len(path)} arrays, wanted two, t and q")
+            raise SettingsError(f"ghost {label!r} has {len(path)} arrays, expected two, t and q")
         _check(*path, rate)
     gaps = [Mark(float(t[k]), f"gap of {t[k + 1] - t[k]:.2f} s", "gap") for k in _gaps(t)]
     scene = robot_scene(model)
@@ -535,7 +535,7 @@ def _check_masses(model: RobotModel, label: str, pi: Array) -> None:
     values = real_numbers(pi, f"masses of {label!r}")
     if values.shape not in [(size,) for size in sizes] or not np.isfinite(values).all():
         raise DataError(
-            f"masses of {label!r} have shape {values.shape}, wanted {sizes[0]} or {sizes[1]} "
+            f"masses of {label!r} have shape {values.shape}, expected {sizes[0]} or {sizes[1]} "
             "finite numbers, as of model.standard_parameters()"
         )
 
@@ -544,13 +544,13 @@ def _check(t: Array, q: Array, rate: float) -> None:
     for name, values in (("t", t), ("q", q)):
         require_kind(values, np.ndarray, name, "an array of numbers")
         if values.dtype.kind not in "biuf":
-            raise DataError(f"{name} is an array of {values.dtype}, wanted numbers")
+            raise DataError(f"{name} is an array of {values.dtype}, expected numbers")
     if not (is_number(rate) and rate > 0):
-        raise SettingsError(f"rate is {rate!r}, wanted a positive number of keyframes per second")
+        raise SettingsError(f"rate is {rate!r}, expected a positive number of keyframes per second")
     if t.ndim != 1 or q.ndim != 2 or len(t) != len(q):
-        raise DataError(f"t has shape {t.shape} and q {q.shape}, wanted (N,) and (N, n)")
+        raise DataError(f"t has shape {t.shape} and q {q.shape}, expected (N,) and (N, n)")
     if len(t) < 2:
-        raise DataError(f"the motion has {len(t)} samples, wanted at least 2 to play")
+        raise DataError(f"the motion has {len(t)} samples, expected at least 2 to play")
     if not (np.isfinite(t).all() and np.isfinite(q).all()):
         raise DataError("t or q has values that are not finite; exclude those samples")
     reversed_rows = np.flatnonzero(np.diff(t) <= 0)
@@ -598,11 +598,11 @@ def _torque_data(model: RobotModel, torques: Torques, t: Array) -> dict[str, Any
     labels, wanted = ["measured", *torques.predicted], (len(torques.t), len(model.joints))
     for label, values in zip(labels, series, strict=True):
         if values.shape != wanted:
-            raise DataError(f"torques {label!r} have shape {values.shape}, wanted {wanted}")
+            raise DataError(f"torques {label!r} have shape {values.shape}, expected {wanted}")
     rms = np.sqrt(np.nanmean(torques.measured**2, axis=0))
     noise = rms if torques.noise is None else np.asarray(torques.noise, dtype=float)
     if noise.shape != wanted[1:]:
-        raise DataError(f"noise has shape {noise.shape}, wanted {wanted[1:]}")
+        raise DataError(f"noise has shape {noise.shape}, expected {wanted[1:]}")
     units = model.row_units[-len(model.joints) :]
     full, unit = (0.5, "RMS torque") if torques.noise is None else (6.0, "RMS noise")
     if torques.quantity == "position":

@@ -78,7 +78,7 @@ def test_the_topic_must_be_stated_if_several_would_do(tmp_path):
         read_log(path, JOINTS, source=LogSource(topic="/arn"))
     kinds = f"{STATE} or control_msgs/msg/JointTrajectoryControllerState"
     with refused(
-        f"bag: topic '/chatter' has messages of std_msgs/msg/String, wanted {kinds}; {listing}"
+        f"bag: topic '/chatter' has messages of std_msgs/msg/String, expected {kinds}; {listing}"
     ):
         read_log(path, JOINTS, source=LogSource(topic="/chatter"))
 
@@ -234,7 +234,7 @@ def test_topics_of_commands_that_cannot_be_are_refused(tmp_path):
         (LogSource(command="/joint_comands"), "bag has no topic '/joint_comands'; topics: "),
         (
             LogSource(command="/chatter"),
-            "bag: topic '/chatter' has messages of std_msgs/msg/String, wanted",
+            "bag: topic '/chatter' has messages of std_msgs/msg/String, expected",
         ),
         (replace(COMMANDS, topic="/joint_commands"), "bag: topic and command are both '/joint_co"),
     ):

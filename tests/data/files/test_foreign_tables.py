@@ -166,7 +166,7 @@ def test_logs_are_given_one_or_several_of_every_kind(ur5, tmp_path, rng):
     assert not measured.has_torque
     cases = ((3, "int"), ([log, None], "NoneType"), ({"q": 1}, "dict"), (log.q, "ndarray"))
     for wrong, kind in cases:
-        with pytest.raises(DataError, match=f"^a log is a {kind}, wanted a robotid.Log, the path"):
+        with pytest.raises(DataError, match=f"^a log is a {kind}, expected a robotid.Log, the"):
             read_logs(wrong, ur5.joints)
 
 
@@ -184,7 +184,7 @@ def test_swapped_arguments_are_named(ur5, rng, tmp_path):
         for call in (robotid.identify, partial(robotid.payload, reference=[log])):
             with pytest.raises(ModelError, match=rf"model is {what}, and .*; swap the two"):
                 call(given, robot)
-    with pytest.raises(ModelError, match="model is a Log, wanted a RobotModel or the path"):
+    with pytest.raises(ModelError, match="model is a Log, expected a RobotModel or the path"):
         robotid.identify(log, log)
 
 
@@ -397,8 +397,8 @@ DOUBLE = "same name for .* of action, number 1, and number 0 of action; give eac
     ("change", "text"),
     [
         (MISSING, "does not describe a LeRobot dataset of version 2"),
-        (None, "features is None, wanted a table of tables"),
-        ({"action": 5}, "wanted a table of tables"),
+        (None, "features is None, expected a table of tables"),
+        ({"action": 5}, "expected a table of tables"),
         ({"image": {}}, "neither observation.state nor action"),
         *[({"action": {"names": names}}, NAMELESS)
           for names in (None, 5, {"m": 5}, [["a"], 5])],

@@ -159,7 +159,7 @@ def test_suffixes_of_formats_are_known_in_any_case(tmp_path):
     (tmp_path / "run.xlsx").touch()
     known = ".csv, .dat, .txt, .parquet, .npz, .h5, .hdf5, .mat"
     with refused(
-        f"run.xlsx: the suffix is '.xlsx', wanted a log file of type {known}, .mcap, .db3 or "
+        f"run.xlsx: the suffix is '.xlsx', expected a log file of type {known}, .mcap, .db3 or "
         ".bag, or the folder of a ROS 2 bag or of a LeRobot dataset; convert it"
     ):
         read_log(tmp_path / "run.xlsx", ["a"])
@@ -312,19 +312,19 @@ CSV_FAULTS = [
     ("\n" + HEADER + ROWS, "is empty; its first line must name the columns"),
     (HEADER, "has a header but no rows; record at least 2"),
     (HEADER + "\n", "has a header but no rows; record at least 2"),
-    (HEADER + "0,1,2\n", "has 1 rows, wanted at least 2; record longer"),
+    (HEADER + "0,1,2\n", "has 1 rows, expected at least 2; record longer"),
     (ROWS, "has no header. State the names of its 3 columns in the job file, and the rate of its "
      'rows if none of them is the time. An example:\n[log]\nnames = ["time", "q_1", "tau_1"]'),
     ("time,q_a,q_a,tau_a\n0,1,2,3\n1,1,2,3\n", "has more than one column q_a; rename or remove"),
     (HEADER + ROWS + "0.2,1.", ": line 4 has 2 cells, the header has 3; correct it"),
     (HEADER + "0.0,1.0,2.0,9.0\n" + ROWS, ": line 2 has 4 cells, the header has 3; correct it"),
-    (HEADER + ROWS + "0.2,abc,3.0\n", ": q_a is 'abc' at row 2, wanted a number; remove the row"),
-    (HEADER + ROWS + "0.2,1.0,\n", ": tau_a is empty at row 2, wanted a number; remove the row"),
-    ("time;q_a;tau_a\n0,0;1,0;2,0\n", ": time is '0,0' at row 0, wanted a number; write decimals "
+    (HEADER + ROWS + "0.2,abc,3.0\n", ": q_a is 'abc' at row 2, expected a number; remove the row"),
+    (HEADER + ROWS + "0.2,1.0,\n", ": tau_a is empty at row 2, expected a number; remove the row"),
+    ("time;q_a;tau_a\n0,0;1,0;2,0\n", ": time is '0,0' at row 0, expected a number; write decimals "
      "with a point; remove"),
     ((HEADER + ROWS).encode("utf-16"), "is not UTF-8 text"),
     (HEADER.encode() + b"\xe9\n", "is not UTF-8 text"),
-    ("time,q_a,wrench_fz_f\n0,1,2\n0.1,1,\n0.2,1,3\n", "wrench_fz_f is empty at row 1, wanted a "
+    ("time,q_a,wrench_fz_f\n0,1,2\n0.1,1,\n0.2,1,3\n", "wrench_fz_f is empty at row 1, expected a "
      "number; interpolate a column of another rate"),
     (f"{HEADER}0,0,0\n{BIG},0,0\n", "time is "),
     (f'{HEADER}0,0,0\n"{BIG},0,0\n', "line 3 "),
@@ -362,8 +362,12 @@ def test_parquet_columns_become_numbers_or_are_refused(tmp_path):
     stamps = pa.array([0, 1, 2], pa.timestamp("ns"))
     pq.write_table(pa.table({"time": stamps, "q_a": [0, 1, 2], "tau_a": [0, 1, 2]}),
                    tmp_path / "run.parquet")  # fmt: skip
-    with refused("run.parquet: time contains timestamp[ns], wanted numbers; convert it"):
+    with refused("run.parquet: time contains timestamp[ns], expected numbers; convert it"):
         read_log(tmp_path / "run.parquet", ["a"])
+    empty = dict.fromkeys(["t", "q_a", "q_b", "tau_a"], np.empty(0))
+    pq.write_table(pa.table(empty), tmp_path / "run.parquet")
+    with pytest.raises(DataError, match=r"^run\.parquet has no column 'tau_b'"):
+        read_log(tmp_path / "run.parquet", ["a", "b"])
 
 
 def test_tables_of_texts_are_read_from_csv_and_parquet(tmp_path):
@@ -378,11 +382,11 @@ def test_tables_of_texts_are_read_from_csv_and_parquet(tmp_path):
     assert read_text_table(tmp_path / "t.csv") == expected
     assert read_text_table(tmp_path / "t.parquet") == expected
     for name, content, fragment in (
-        ("f.csv", "a,b\n1,2,3\n", "row 1 has 3 values, wanted 2"),
+        ("f.csv", "a,b\n1,2,3\n", "row 1 has 3 values, expected 2"),
         ("f.csv", "", "is empty"),
         ("f.csv", "a,a\n1,2\n", "several columns 'a'"),
         ("f.csv", 'a\n"x\n', "is not a CSV table"),
-        ("f.txt", "a\n1\n", "the suffix is '.txt', wanted a table of type .csv or .parquet"),
+        ("f.txt", "a\n1\n", "the suffix is '.txt', expected a table of type .csv or .parquet"),
         ("f.parquet", "a\n1\n", "broken Parquet file"),
         ("none.csv", None, "there is no table"),
     ):
@@ -547,13 +551,13 @@ def test_arrays_of_a_fixed_base_have_no_free_joint(flight, tmp_path):
 def test_arrays_of_another_width_are_refused(flight, tmp_path):
     arrays, _ = flight
     np.savez(tmp_path / "log.npz", joints=["hip"], **arrays)
-    with pytest.raises(DataError, match=r"qpos has 9 columns, wanted 1, .* or 7 more with a free"):
+    with pytest.raises(DataError, match=r"qpos has 9 columns, expected 1, .* or 7 more with a"):
         read_log(tmp_path / "log.npz", ["hip"], base=BASE)
     np.savez(
         tmp_path / "log.npz", joints=BODY, time=arrays["time"], joint_pos=arrays["qpos"][:, 7:],
         root_state_w=arrays["qpos"][:, :7],
     )  # fmt: skip
-    with pytest.raises(DataError, match="root_state_w has 7 columns, wanted 13"):
+    with pytest.raises(DataError, match="root_state_w has 7 columns, expected 13"):
         read_log(tmp_path / "log.npz", BODY, base=BASE, needs="motion")
 
 
@@ -580,8 +584,8 @@ def test_a_file_of_noise_a_pipe_a_device_and_a_folder_are_no_log(tmp_path):
     (tmp_path / "run.h5").mkdir()
     (tmp_path / "null.csv").symlink_to("/dev/null")
     for name, fragment in [
-        ("run.csv", "run.csv' is a pipe or a device, wanted a log file"),
-        ("null.csv", "null.csv' is a pipe or a device, wanted a log file"),
+        ("run.csv", "run.csv' is a pipe or a device, expected a log file"),
+        ("null.csv", "null.csv' is a pipe or a device, expected a log file"),
         ("run.h5", "run.h5 is a folder without metadata.yaml, so it is not a ROS 2 bag, and "
          "without meta/info.json, so it is not a LeRobot dataset"),
         ("none.csv", "there is no log file '.*none.csv'"),

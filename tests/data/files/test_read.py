@@ -191,8 +191,8 @@ REFUSED = {
                                   "renames 'elbo', which is not among the joints read", "Did you"),
     "gain of another joint": ({}, dict(gains={"elbo": 1.0}), "a gain is given for 'elbo', which is "
                               "not among the joints read: shoulder, elbow. Did you mean 'elbow'?"),
-    "gain 0": ({}, dict(gains={"elbow": 0.0}), "gain of 'elbow' is 0.0, wanted a number other"),
-    "gain NaN": ({}, dict(gains={"elbow": np.nan}), "gain of 'elbow' is nan, wanted a number"),
+    "gain 0": ({}, dict(gains={"elbow": 0.0}), "gain of 'elbow' is 0.0, expected a number other"),
+    "gain NaN": ({}, dict(gains={"elbow": np.nan}), "gain of 'elbow' is nan, expected a number"),
     "no gain": (dict(tau_elbow=None, i_elbow=ONE), {}, "joint 'elbow' has the current 'i_elbow' but"
                 " no gain; state it in N m/A: --gain elbow=..., or in the job file [torque] gains",
                 "robotid payload URDF LOADED --reference BARE --mass KG --gains$"),
@@ -206,7 +206,7 @@ REFUSED = {
     "text": (dict(tau_elbow=["much"] * 300), {}, "column 'tau_elbow' contains", "convert it"),
     "far": (dict(q_elbow=20 * LOG.q[:, 1]), {}, "q_elbow reaches 20, which looks like degrees"),
     "outside": ({}, dict(start=2000.0), "0 rows lie between 2000 s", "the log spans 1000 s to 100"),
-    "needs": ({}, dict(needs="everything"), "needs is 'everything', wanted one of torque, motion"),
+    "needs": ({}, dict(needs="everything"), "is 'everything', expected one of torque, motion"),
     "no commands": ({}, dict(needs="commands"), "commanded position columns found: none. Record the"
                     " commands of the controller"),
     "half a command": (dict(qref_elbow=ONE, q_shoulder=ONE), dict(needs="commands"), "no column "
@@ -232,7 +232,7 @@ def test_a_log_that_is_refused_says_why(changes, reading, fragments):
 
 @pytest.mark.parametrize("joints", [(), "elbow", ("elbow", 3), 5])
 def test_joints_must_be_a_list_of_names(joints):
-    with pytest.raises(SettingsError, match="wanted a list of at least one name"):
+    with pytest.raises(SettingsError, match="expected a list of at least one name"):
         read_log(frame(), joints)
     with pytest.raises(SettingsError, match="joints has elbow more than once; name each joint"):
         read_log(frame(), ["elbow", "elbow"])
@@ -356,7 +356,7 @@ def test_percentages_become_positions_between_their_ends():
     np.testing.assert_allclose(log.q_ref, LOG.q[::-1], atol=1e-12)
     np.testing.assert_allclose(log.v_ref, LOG.v[::-1], atol=1e-12)
     for wrong in ([0.1], [0.3, 0.3], ["a", 1.0], 5.0, [0.0, np.inf]):
-        with pytest.raises(SettingsError, match=r"percent of jaw is .* wanted two different"):
+        with pytest.raises(SettingsError, match=r"percent of jaw is .* expected two different"):
             LogUnits(percent={"jaw": wrong})
 
 
@@ -406,12 +406,12 @@ def test_faults_of_a_base_and_of_cells_of_a_foot_are_named(tmp_path):
     lost = np.where(np.arange(90) == 7, np.nan, t)
     refused(r"log: base_z is NaN at row 7 \(t = 2.07 s\); remove the row", base_z=lost)
     refused(r"log: wrench_fz_f is NaN at row 7", wrench_fz_f=lost)
-    refused(r"base_roll and base_pitch are up to 20, wanted at most pi", base_pitch=t[-1] - t - 20)
+    refused(r"base_roll and base_pitch are up to 20, expected at most", base_pitch=t[-1] - t - 20)
     cells = {"wrench_fz_f": None, "wrench_fz_f_0": t, "wrench_fz_f_1": t}
     refused(r"If wrench_fz_f_0, wrench_fz_f_1 are cells of a foot, add a column of their", **cells)
     table["wrench_fz_f"] = [[x, x] for x in t]
     pd.DataFrame(table).to_parquet(tmp_path / "run.parquet")
-    with pytest.raises(DataError, match="wanted numbers; write one column per value, or their sum"):
+    with pytest.raises(DataError, match="expected numbers; write one column per value, or their"):
         read_log(tmp_path / "run.parquet", ["a"], base=wanted)
 
 
@@ -540,12 +540,12 @@ def refused(text, kind=DataError):
         ({"matrix": (10.0, 0.0)}, "transmission of elbow, wrist: matrix [10.0, 0.0] is singular"),
         (
             {"matrix": ((1.0, 1.0),)},
-            "transmission of elbow, wrist: matrix is [[1.0, 1.0]], wanted 2 rows of 2 numbers",
+            "transmission of elbow, wrist: matrix is [[1.0, 1.0]], expected 2 rows of 2 numbers",
         ),
         ({"motors": ("m2", "m2")}, "transmission: motors contains m2 twice"),
-        ({"motors": ("m2",)}, "transmission of elbow, wrist: motors has 1 entries, wanted 2"),
-        ({"efficiency": (0.9, 1.2)}, "transmission: efficiency of 'm3' is 1.2, wanted more than 0"),
-        ({"matrix": "file"}, "transmission: matrix is 'file', wanted rows of numbers"),
+        ({"motors": ("m2",)}, "transmission of elbow, wrist: motors has 1 entries, expected 2"),
+        ({"efficiency": (0.9, 1.2)}, "transmission: efficiency of 'm3' is 1.2, expected more than"),
+        ({"matrix": "file"}, "transmission: matrix is 'file', expected rows of numbers"),
     ],
 )
 def test_an_impossible_transmission_is_refused(change, text):

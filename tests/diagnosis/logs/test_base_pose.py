@@ -365,7 +365,7 @@ def test_the_mean_specific_force_in_the_world_is_stated_for_a_robot_that_drives_
     assert found.evidence["size"] == pytest.approx(size, rel=5e-3)
     assert found.evidence["angle"] == pytest.approx(angle, abs=0.3)
     assert f"is {size:.3g} m/s^2 on average, {angle:.0f} deg from the vertical" in found.message
-    assert "wanted 9.81 m/s^2 upwards: its scale is wrong" in found.message
+    assert "expected 9.81 m/s^2 upwards: its scale is wrong" in found.message
     assert not list(check_base(free, log.window(4.0, 5.9), RAW))  # too short for a mean
 
 

@@ -2,11 +2,12 @@
 
 import json
 import os
+import sys
 from collections import Counter
 from functools import lru_cache
 
 import pytest
-from helpers.paths import DOCS
+from helpers.paths import ROOT
 
 from robotid.diagnosis.urdf.inspection import inspect_urdf
 from robotid.dynamics.base_parameters import structural_mapping
@@ -14,8 +15,10 @@ from robotid.robot import bodies
 from robotid.robot.examples import example_urdfs
 from robotid.robot.model import RobotModel
 
-AUDIT, COUNTS = DOCS / "evidence/urdf_audit.md", DOCS / "evidence/base_counts.md"
-WRITES = {"ROBOTID_WRITE_AUDIT", "ROBOTID_WRITE_COUNTS"} & set(os.environ)
+sys.path.append(str(ROOT / "benchmarks"))
+from write_tables import read, write
+
+WRITES = "ROBOTID_WRITE_DOCS" in os.environ
 #: Take four fifths of the time, and have no finding that no other robot has. All are inspected to
 #: write the tables; every robot is opened in tests/robot/test_model.py.
 LARGE = {
@@ -36,11 +39,11 @@ def inspections():
         return {path: inspect_urdf(path) for path in chosen}
 
 
-def assert_documented(document, lines):
-    """Assert that a table's head and rows are in a document, which has no row twice."""
-    documented = document.read_text().splitlines()
-    assert documented.count(lines[0]) == 1
-    assert [line for line in documented if line in set(lines)] == lines
+def assert_documented(name, rows):
+    """Assert that a table has the head and these rows, none twice; write it if asked for."""
+    if WRITES:
+        write(name, rows)
+    assert [row for row in read(name) if row in rows] == rows
 
 
 def test_example_robots_can_be_inspected(inspections):
@@ -61,7 +64,7 @@ def test_example_robots_can_be_inspected(inspections):
 
 
 def test_the_table_of_example_robots_is_the_documents(inspections):
-    lines = ["| robot | joints | errors | warnings | which |", "|---|---|---|---|---|"]
+    rows = [["robot", "joints", "errors", "warnings", "which"]]
     for path, found in inspections.items():
         graves = [f for f in found.findings if f.severity != "note"]
         counts = Counter(f.code for f in graves)
@@ -69,17 +72,12 @@ def test_the_table_of_example_robots_is_the_documents(inspections):
         which = ", ".join(f"{code} {count}" for code, count in sorted(counts.items()))
         name = f"{path.parent.parent.name}/{path.name}"
         cells = [name, len(found.joints), errors, len(graves) - errors, which or "–"]
-        lines.append(f"| {' | '.join(map(str, cells))} |")
-    if os.environ.get("ROBOTID_WRITE_AUDIT"):
-        AUDIT.write_text(AUDIT.read_text().split("| robot |")[0] + "\n".join(lines) + "\n")
-    assert_documented(AUDIT, lines)
+        rows.append([str(cell) for cell in cells])
+    assert_documented("urdf_audit", rows)
 
 
 def test_table_of_every_example_robot_is_the_one_in_the_docs(inspections):
-    lines = [
-        "| robot | joints | standard | base, fixed | base, floating |",
-        "|---|---|---|---|---|",
-    ]
+    rows = [["robot", "joints", "standard", "base, fixed", "base, floating"]]
     for path, inspection in inspections.items():
         if inspection.structure is None:
             continue
@@ -87,10 +85,6 @@ def test_table_of_every_example_robot_is_the_one_in_the_docs(inspections):
         floating = RobotModel.from_urdf(path, terms=(), free_flyer=True)
         counts = fixed.base_inertial, len(structural_mapping(floating).K)
         assert counts[0] <= counts[1] <= floating.layout.n_inertial
-        lines.append(
-            f"| {path.parent.parent.name}/{path.name} | {len(inspection.joints)} | "
-            f"{fixed.standard} | {counts[0]} | {counts[1]} |"
-        )
-    if os.environ.get("ROBOTID_WRITE_COUNTS"):
-        COUNTS.write_text(COUNTS.read_text().split("| robot |")[0] + "\n".join(lines) + "\n")
-    assert_documented(COUNTS, lines)
+        name = f"{path.parent.parent.name}/{path.name}"
+        rows.append([name, *map(str, (len(inspection.joints), fixed.standard, *counts))])
+    assert_documented("base_counts", rows)

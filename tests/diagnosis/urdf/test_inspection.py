@@ -112,21 +112,21 @@ MIMIC = '<mimic joint="shoulder" multiplier="-2"/></joint>\n</robot>'
 ORIGIN, TURNED = '<origin xyz="0.5 0 0"/>', '<origin xyz="0.5 0 0" rpy="3.1416 0 0"/>'
 #: What is changed, and the finding: code, subject, severity, a part of its sentence.
 FAULTS = [
-    ('"1"/>', '"0"/>', "zero_mass", "link lower", "warning", "has the mass 0 kg, wanted more"),
+    ('"1"/>', '"0"/>', "zero_mass", "link lower", "warning", "has the mass 0 kg, expected more"),
     ("</robot>", TOOL.format(inertial=INERTIAL.format(m=0)), "zero_mass", "link tool", "note", ""),
-    ('"2"/>', '"-2"/>', "negative_mass", "link upper", "error", "mass -2 kg, wanted more than 0"),
+    ('"2"/>', '"-2"/>', "negative_mass", "link upper", "error", "mass -2 kg, expected more than 0"),
     ('izz="0.11"', 'izz="0.23"', "not_positive_definite", "link upper", "error",
-     "the sum of the two smaller ones is 0.22, wanted more than 0.23"),
+     "the sum of the two smaller ones is 0.22, expected more than 0.23"),
     ('ixy="0"', 'ixy="0.2"', "not_positive_definite", "link upper", "error",
-     "are not all positive, wanted > 0 (-0.09"),
+     "are not all positive, expected > 0 (-0.09"),
     ('izz="0.11"', 'izz="0.22"', "not_positive_definite", "link upper", "note", "flat or thin"),
-    (LIMIT, "", "no_limits", "joint shoulder", "warning", "lower None, upper None, wanted lower <"),
+    (LIMIT, "", "no_limits", "joint shoulder", "warning", "lower None, upper None, expected lower"),
     ('lower="-1" upper="1"', 'lower="1" upper="-1"', "no_limits", "joint shoulder", "warning",
-     "lower 1.0, upper -1.0, wanted lower < upper"),
+     "lower 1.0, upper -1.0, expected lower < upper"),
     (LIMIT, LIMIT.replace('"9"', '"0"').replace('"2"', '"0.0"'), "no_limits", "joint shoulder",
-     "warning", "has limits velocity 0 and effort 0, wanted more than 0"),
+     "warning", "has limits velocity 0 and effort 0, expected more than 0"),
     ('damping="0.5"', 'damping="-0.5"', "negative_damping", "joint shoulder", "warning",
-     "has damping -0.5, wanted 0 or more"),
+     "has damping -0.5, expected 0 or more"),
     ('friction="0.25"', 'friction="-0.25"', "negative_friction", "joint shoulder", "warning",
      "Pinocchio rejects"),
     ('rpy="0 0 0"', 'rpy="0 -3.1416 0.1"', "rounded_rpy", "joint shoulder", "note",
@@ -382,7 +382,7 @@ def test_an_ellipsoid_longer_than_its_box_allows_is_a_note_with_both_lengths(tmp
     length = 2 * np.sqrt(5 * (0.04 + 0.09 - 0.0567) / 2 / 4.0)  # along y
     assert Figures(found) == pytest.approx({"length": length, "side": 0.1})
     assert (
-        f"is {length:.3g} m long in y, the box of its geometry 0.1 m; wanted: at most 0.224 m"
+        f"is {length:.3g} m long in y, the box of its geometry 0.1 m; expected: at most 0.224 m"
         in (found.message)
     )
     limit = 0.1**2 / 4  # variance of two halves on two sides
@@ -413,7 +413,7 @@ def test_a_link_without_geometry_is_compared_with_the_distance_of_its_joints(tmp
     length = np.sqrt((2.3 * reference) ** 2 - 4 * 5 / 4.0 * 1e-3 / 2)
     assert Figures(finding) == pytest.approx({"length": length, "side": reference})
     assert "is 1.03 m long, its joints allow a length of about 0.45 m" in finding.message
-    assert "(wanted: at most 0.72 m)" in finding.message
+    assert "(expected: at most 0.72 m)" in finding.message
     (finding,) = slender(tmp_path, 0.3, com=-0.5)
     assert (finding.code, finding.severity) == ("com_outside", "warning")
     assert Figures(finding) == pytest.approx({"outside": 0.05})

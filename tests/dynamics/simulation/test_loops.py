@@ -462,10 +462,10 @@ def test_robots_and_terms_that_cannot_be_rolled_out_are_named(planar):
 @pytest.mark.parametrize(
     ("term", "value", "words"),
     [
-        (Coulomb(), -5.0, r"simulation of FL_hip_joint .*joint.coulomb is -5, wanted 0 or more"),
-        (LoadFriction(), 1.4, r"FL_hip_joint.load is 1.4, wanted at most 0.5. Set other friction"),
+        (Coulomb(), -5.0, r"simulation of FL_hip_joint .*joint.coulomb is -5, expected 0 or more"),
+        (LoadFriction(), 1.4, r"FL_hip_joint.load is 1.4, expected at most 0.5. Set other"),
         (PositionCoulomb(order=1, centre=0.9), 3.0,
-         r"FL_hip_joint .* its Coulomb friction is -3.11 N m at -0.136 rad, wanted 0 or more"),
+         r"FL_hip_joint .* its Coulomb friction is -3.11 N m at -0.136 rad, expected 0 or more"),
     ],
 )  # fmt: skip
 def test_friction_without_a_solution_is_named_with_joint_value_and_time(legs, term, value, words):
@@ -481,7 +481,7 @@ def test_the_inertia_without_a_solution_is_that_at_the_positions_of_the_urdf(pla
     loops = loops_of(planar, zero=np.array([0.0, 0.9]))
     M = pin.crba(planar.pin_model, planar.pin_model.createData(), np.array([0.0, 0.5]))
     why = why_no_solution(planar, loops, np.array([0, 1]), np.array([0.0, -0.4]), 0, 2e-3)
-    assert f"its gain kp is 20 and its inertia {M[0, 0] + 0.01:.3g}, wanted kp below" in why
+    assert f"its gain kp is 20 and its inertia {M[0, 0] + 0.01:.3g}, expected kp below" in why
 
 
 def test_friction_that_falls_faster_than_inertia_allows_slips_as_in_small_steps(tmp_path):

@@ -67,9 +67,9 @@ def test_a_motion_through_samples_begins_with_the_first(knows_more):
 
 
 ERRORS = {
-    "amplitude has shape (), wanted (n,) or (R, n), finite": (DataError, (np.array(1.0), 1.0)),
-    "duration has shape (3,), wanted () or (4,)": (DataError, (np.ones((4, 2)), np.ones(3))),
-    "duration is 0.0, wanted a positive number": (SettingsError, (np.ones(2), 0.0)),
+    "amplitude has shape (), expected (n,) or (R, n), finite": (DataError, (np.array(1.0), 1.0)),
+    "duration has shape (3,), expected () or (4,)": (DataError, (np.ones((4, 2)), np.ones(3))),
+    "duration is 0.0, expected a positive number": (SettingsError, (np.ones(2), 0.0)),
 }
 
 

@@ -136,7 +136,7 @@ def test_gains_rates_and_durations_beyond_reason_are_told(ur5):
     with pytest.raises(DataError, match=r"the simulation diverged at t = .* lower gains"):
         followed(ur5, truth(ur5), wild)
     for rate, duration, steps in ((1e5, 3600.0, "1"), (1e-3, 5e3, r"\d{6,}")):
-        words = rf"has .* samples of {steps} steps each, wanted at most 2e\+07 steps in total and"
+        words = rf"has .* samples of {steps} steps each, expected at most 2e\+07 steps in total and"
         with pytest.raises(SettingsError, match=words):
             followed(ur5, truth(ur5), Simulation(), rate=rate, duration=duration)
 
@@ -234,7 +234,7 @@ def test_samples_are_lost_at_random(run):
     kept = np.searchsorted(run.t, log.t)
     np.testing.assert_array_equal(log.tau, run.tau[kept])
     two = Run(*(x[:3] for x in (run.t, run.q, run.v, run.a, run.tau, run.q)), np.zeros(2))
-    with pytest.raises(DataError, match=r"of 3 samples remain, wanted at least 2. Set a smaller"):
+    with pytest.raises(DataError, match=r"of 3 samples remain, expected at least 2. Set a smaller"):
         of(two, dropped=0.999)
 
 
@@ -243,9 +243,9 @@ def test_settings_that_cannot_be_are_named(run):
         "sensors: noise.q is stated for 'c', which is not a moving joint: a, b"
     )):  # fmt: skip
         of(run, noise=Noise(q={"c": 1.0}))
-    with pytest.raises(SettingsError, match=r"sensors.noise: q is -1.0, wanted 0 to 1e12"):
+    with pytest.raises(SettingsError, match=r"sensors.noise: q is -1.0, expected 0 to 1e12"):
         Noise(q=-1.0)
-    with pytest.raises(SettingsError, match=r"sensors: dropped is 1.0, wanted 0 to less than 1"):
+    with pytest.raises(SettingsError, match=r"sensors: dropped is 1.0, expected 0 to less than 1"):
         Sensors(dropped=1.0)
 
 

@@ -64,7 +64,7 @@ ERRORS = {
     "truth: values: 'elbow_joint.viscos' is not a parameter of ur5. Did you mean "
     "'elbow_joint.viscous'?": {"elbow_joint.viscos": 1.0},
     "truth: body 'forearm_link' is physically inconsistent": {"forearm_link.m": 0.01},
-    "truth: elbow_joint.viscous is -1 N m s/rad, wanted 0 or more": {"elbow_joint.viscous": -1.0},
+    "truth: elbow_joint.viscous is -1 N m s/rad, expected 0 or more": {"elbow_joint.viscous": -1.0},
 }
 
 

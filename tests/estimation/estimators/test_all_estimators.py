@@ -81,7 +81,7 @@ def test_a_sample_of_another_shape_is_refused(make, states):
     problem = states.problem
     estimator, state = started(make, states)
     sample = next(problem.samples())
-    with pytest.raises(DataError, match=r"the sample has Y \(3, 22\), .*wanted \(3, 23\)"):
+    with pytest.raises(DataError, match=r"the sample has Y \(3, 22\), .*expected \(3, 23\)"):
         estimator.update(state, replace(sample, Y=sample.Y[:, 1:]))
 
 

@@ -186,7 +186,7 @@ def two_bodies():
         ({"mass": {"one": (0.1, 0.9)}}, "joints alone have 1 kg"),
         ({"mass": {"tool": (1.0, 2.0)}}, r"\['tool'\], which are not bodies of the model"),
         ({"mass": {"two": (3.0, 2.0)}}, r"\[3, 2\] kg: the first value is larger"),
-        ({"mass": {"two": (-2.0, -1.0)}}, "is bounded by -1 kg, wanted a positive"),
+        ({"mass": {"two": (-2.0, -1.0)}}, "is bounded by -1 kg, expected a positive"),
         ({"mass": {"two": (0.1, 4.0)}, "pinned": ("two",)}, r"the URDF's 5 kg, outside its bounds"),
         ({"pinned": ("two",),
           "com": {"two": (np.vstack([np.eye(3), -np.eye(3)]), np.array([9, 0.15, 9, 9, 9, 9.0]))}},

@@ -145,10 +145,10 @@ def test_usual_friction_that_depends_on_the_load_is_that_at_its_rms_over_the_row
     curve = Fit.friction(found, ELBOW, [0.4])
     assert curve.load == pytest.approx(np.sqrt(np.mean(np.concatenate(loads) ** 2)))
     for wrong, words in (
-        ({"load": np.inf}, "load is 'inf', wanted a finite number or None"),
-        ({"q": "up"}, "q is 'up', wanted a finite number or None"),
-        ({"v": [[0.1, 0.2]]}, r"v has shape \(1, 2\), wanted finite speeds, shape \(k,\)"),
-        ({"v": [0.1, np.inf]}, r"v has shape \(2,\), wanted finite speeds"),
+        ({"load": np.inf}, "load is 'inf', expected a finite number or None"),
+        ({"q": "up"}, "q is 'up', expected a finite number or None"),
+        ({"v": [[0.1, 0.2]]}, r"v has shape \(1, 2\), expected finite speeds, shape \(k,\)"),
+        ({"v": [0.1, np.inf]}, r"v has shape \(2,\), expected finite speeds"),
         ({"joint": "elbow"}, r"'elbow' is no drive of .*; drives: .*pair"),
     ):
         with pytest.raises(DataError, match=words):

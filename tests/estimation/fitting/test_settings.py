@@ -49,9 +49,9 @@ def test_a_recursive_estimate_is_made_physical_on_request(rng, name):
     [
         ({"name": "rls", "walk": 0.1}, "'rls' has no setting 'walk'; it has forgetting, "),
         ({"name": "ols", "margin": 1.0}, "'ols' has no setting 'margin'; it has none"),
-        ({"name": "rls", "forgetting": 1.1}, "forgetting is 1.1, wanted 0 < x <= 1"),
-        ({"name": "kalman", "walk": -1.0}, "walk is -1.0, wanted x >= 0"),
-        ({"name": "kalman", "gate": True}, "gate is True, wanted 0.5 <= x < 1, or false"),
+        ({"name": "rls", "forgetting": 1.1}, "forgetting is 1.1, expected 0 < x <= 1"),
+        ({"name": "kalman", "walk": -1.0}, "walk is -1.0, expected x >= 0"),
+        ({"name": "kalman", "gate": True}, "gate is True, expected 0.5 <= x < 1, or false"),
         ({"name": "consistent", "prior_weight": "x"}, "finite number or one of auto, cv, evidence"),
     ],
 )

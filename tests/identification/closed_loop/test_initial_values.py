@@ -247,7 +247,7 @@ def test_a_chosen_term_with_negative_friction_is_dropped_and_the_fit_goes_on(mod
     found = identify_loops(model, [log], [], LoopSettings(kp=KP), SimulationSettings())
     [finding] = [f for f in found.findings if f.code.startswith("friction")]
     assert (finding.code, finding.severity, finding.where) == ("friction_dropped", "warning", "j")
-    assert "N m, wanted 0 or more. The term was dropped" in finding.message
+    assert "N m, expected 0 or more. The term was dropped" in finding.message
     [tried] = [t for t in found.fit.tried if t.dropped]
     assert (tried.terms, tried.is_chosen) == (("stribeck",), False)
     assert [term.name for term in found.fit.loops.terms[0]] == ["viscous", "coulomb", "offset"]

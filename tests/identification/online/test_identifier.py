@@ -108,7 +108,7 @@ def test_a_bad_sample_is_refused_without_harm(ur5, rng):
         clean.update(log.t[-1], log.q[0], log.q[0], log.q[0], log.tau[0])
     with pytest.raises(DataError, match="is not finite, so it was refused"):
         clean.update(9.0, log.q[0], bad, log.q[0], log.tau[0])
-    with pytest.raises(DataError, match=r"wanted \(6,\) each"):
+    with pytest.raises(DataError, match=r"expected \(6,\) each"):
         clean.update(9.0, log.q[0], bad[:5], log.q[0], log.tau[0])
     with pytest.raises(DataError, match="t must increase"):
         clean.update(log.t[-1], log.q[0], log.tau[0])

@@ -158,7 +158,7 @@ def test_impossible_drives_are_refused(result, tmp_path):
         changed = with_entries(
             lambda e, n=name, x=wrong: e | ({"value": x} if e["name"] == n else {})
         )
-        with pytest.raises(DataError, match=f"{name} is {wrong:g}, wanted {wanted}"):
+        with pytest.raises(DataError, match=f"{name} is {wrong:g}, expected {wanted}"):
             _ = changed.commanded
     none = with_entries(lambda e: None if e["name"].endswith((".kp", ".kd")) else e)
     assert none.commanded == ()
@@ -242,7 +242,7 @@ def test_isaac_actuators_are_grouped_and_read_back(result, tmp_path, capsys):
 
 def test_the_pages_name_each_format():
     readme, page = (
-        path.read_text() for path in (ROOT / "README.md", DOCS / "reference" / "export_formats.md")
+        path.read_text() for path in (ROOT / "README.md", DOCS / "how_to" / "exports.md")
     )
     for kind in formats():
         assert re.search(rf"`{kind}`|--format {kind} ", readme)

@@ -60,17 +60,17 @@ def test_results_that_are_not_whole_are_refused(result, identified, tmp_path):
 
     *others, last = result["inputs"]
     assert len(others) == 3
-    large = r"\.structure\.base is -1.*, wanted a number of at most 1e\+100$"
+    large = r"\.structure\.base is -1.*, expected a number of at most 1e\+100$"
     text, endless = {**last, "rows_used": "x"}, {k: v for k, v in last.items() if k != "end"}
     for changed, words in (
-        ({**result, "schema_version": 2}, r" has schema_version 2, wanted 1 of a"),
+        ({**result, "schema_version": 2}, r" has schema_version 2, expected 1 of a"),
         ({k: v for k, v in result.items() if k != "inputs"},
          r" has no entry 'inputs': the file is incomplete"),
-        ({**result, "verdict": []}, r"\.verdict is \[\], wanted a table"),
-        ({**result, "verdict": 5}, r"\.verdict is 5, wanted a table"),
+        ({**result, "verdict": []}, r"\.verdict is \[\], expected a table"),
+        ({**result, "verdict": 5}, r"\.verdict is 5, expected a table"),
         (with_base(-1.01e100), large), (with_base(-(10**101)), large),
         ({**result, "inputs": [*others, text]},
-         r"\.inputs\[3\]\.rows_used is 'x', wanted a number"),
+         r"\.inputs\[3\]\.rows_used is 'x', expected a number"),
         ({**result, "inputs": [*others, endless]}, r"\.inputs\[3\] has no entry 'end': the"),
     ):  # fmt: skip
         path.write_text(json.dumps(changed))

@@ -210,8 +210,8 @@ def test_an_impossible_link_is_refused_and_named(source, tmp_path, rng):
         write_urdf(model, pi, tmp_path / "new.urdf")
     assert str(caught.value) == (
         "link 'lower' would be physically impossible: the smallest eigenvalue of its "
-        f"pseudo-inertia is {smallest:.3g}, wanted > 0; identify with the estimator 'consistent', "
-        "whose bodies and drives are possible"
+        f"pseudo-inertia is {smallest:.3g}, expected > 0; identify with the estimator "
+        "'consistent', whose bodies and drives are possible"
     )
     assert listing(tmp_path) == before
 
@@ -221,7 +221,7 @@ def test_a_drive_that_gives_energy_is_refused(source, tmp_path, rng, term):
     model = RobotModel.from_urdf(source)
     pi = possible_parameters(model, rng)
     pi[model.layout.names.index(f"elbow.{term}")] = -0.25
-    with pytest.raises(ModelError, match=rf"elbow.{term} is -0.25 .*, wanted 0 or more; .*consist"):
+    with pytest.raises(ModelError, match=rf"{term} is -0.25 .*, expected 0 or more; .*consist"):
         write_urdf(model, pi, tmp_path / "new.urdf")
     pi[model.layout.names.index(f"elbow.{term}")] = 0.0
     pi[model.layout.names.index("elbow.offset")] = -0.25
@@ -236,7 +236,7 @@ def test_a_target_that_cannot_be_is_refused(source, tmp_path, rng):
     for name in ("arm.urdf", "link.urdf"):
         with pytest.raises(ModelError, match="is the original URDF; choose another name"):
             write_urdf(model, pi, tmp_path / name)
-    with pytest.raises(ModelError, match="is a folder, wanted a file"):
+    with pytest.raises(ModelError, match="is a folder, expected a file"):
         write_urdf(model, pi, tmp_path / "folder.urdf")
     with pytest.raises(ModelError, match=r"the folder '.*none' does not exist; create it"):
         write_urdf(model, pi, tmp_path / "none" / "new.urdf")
@@ -285,7 +285,7 @@ def test_a_pair_that_does_not_belong_together_is_refused(source, tmp_path, rng):
     found = hashlib.sha256(new.read_bytes()).hexdigest()
     assert str(caught.value) == (
         f"new.urdf has changed since new.drive.json was written: its SHA-256 starts "
-        f"with {found[:12]}, wanted {digest[:12]}; restore the file, or write both again"
+        f"with {found[:12]}, expected {digest[:12]}; restore the file, or write both again"
     )
     new.unlink()
     with pytest.raises(ModelError, match=r"there is no URDF file '.*new.urdf'"):

@@ -173,6 +173,23 @@ def test_charts_are_drawn_when_they_come_into_sight_and_areas_are_stacked(seen):
     assert seen.page.evaluate("charts.all[1].index") > 0
 
 
+def test_charts_of_a_group_share_a_legend_with_the_values_of_the_one_pointed_at(browser, tmp_path):
+    a, b = (Series(name, k * np.ones(9), f"tone-{k}") for k, name in ((1, "a"), (2, "b")))
+    parts = [Chart("", np.arange(9.0), both, "t [s]", "[m]") for both in ((a, b), (b,))]
+    html = "".join(chart_html(part, "") for part in parts)
+    html = page("", "<h1>x</h1>", {"x": ("x", f'<div class="plots">{html}</div>')})
+    (tmp_path / "group.html").write_text(html, encoding="utf-8")
+    with visit(browser, tmp_path / "group.html") as seen:
+        until(seen, "charts.all.every((c) => c.plot !== null)")
+        keys = seen.page.locator(".keys button:visible")
+        for chart, values in ((0, ["a1", "b2"]), (1, ["a", "b2"])):
+            seen.page.locator(".u-over").nth(chart).click()
+            assert keys.all_inner_texts() == values
+        keys.last.click()
+        assert seen.page.evaluate("charts.all.map((c) => [...c.hidden])") == [[1], [0]]
+        assert seen.errors == []
+
+
 def colours(seen):
     """Return which colours a chart's first canvas holds."""
     return seen.page.evaluate("""(() => {
@@ -278,6 +295,9 @@ def test_a_verdict_shows_three_reasons_and_folds_all_others():
 
 
 def test_a_command_breaks_between_arguments_only():
+    assert "<i>/my &amp; lab/arm/</i>z.urdf</span> <span>run/a.csv" in command_html(
+        "robotid replay '/my & lab/arm/z.urdf' run/a.csv"
+    ).replace("&#x27;", "")
     assert command_html("robotid replay 'my log.csv' --lock a=0 <x>") == (
         '<pre class="command"><span>robotid</span> <span>replay</span> '
         "<span>&#x27;my log.csv&#x27;</span> <span>--lock</span> <span>a=0</span> "

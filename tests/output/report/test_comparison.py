@@ -183,7 +183,7 @@ def test_a_status_of_another_program_is_refused_and_escaped(marked, tmp_path):
     result["verdict"]["status"] = 'good"><script>alert(1)</script>'
     path = tmp_path / "result.json"
     path.write_text(json.dumps(result))
-    with pytest.raises(DataError, match=r"verdict.status is .*, wanted one of good, usable"):
+    with pytest.raises(DataError, match=r"verdict.status is .*, expected one of good, usable"):
         read_result(path)
     shown = {"label": "A", "name": "", "path": "", "estimator": "", "verdict": result["verdict"]}
     text = page("", comparison._verdict(shown), {})

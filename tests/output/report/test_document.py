@@ -121,8 +121,9 @@ def test_the_distance_at_a_collision_is_its_margin_and_what_is_required():
     entry |= {"unread": [], "left_alone": ["c and d"], "built_near": []}
     course = SimpleNamespace(nearest=None, clearance=object())
     assert Reader(_collisions({"limits": {"collision": entry}}, course)).text == (
-        "Smallest margin to a collision: a and b, distance 32 mm at 1.50 s. Required: 20 mm, also "
-        "between samples. Not checked, since in contact by design: c and d."
+        "Smallest margin to a collision: a and b are 32 mm apart at 1.50 s. Their clearance (the "
+        "smallest allowed distance) is 20 mm, also between samples. Not checked, because these "
+        "links touch by design: c and d."
     )
 
 

@@ -161,6 +161,8 @@ def test_a_missing_replay_is_written_by_the_command_of_the_report(browser, folde
         until(seen, f"{STATE}.includes('missing')")
         command = seen.page.locator("#dock pre").inner_text()
         assert command == seen.page.locator("#replay pre").inner_text()
+        folder_width = "document.querySelector('#replay pre i').offsetWidth"
+        assert seen.page.evaluate(folder_width) < 30  # "…/" stands for the folders of the URDF
         program, *words = shlex.split(command)
         assert program == "robotid"
         assert main(words) == 0

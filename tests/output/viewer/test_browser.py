@@ -53,7 +53,8 @@ def page(ur5, tmp_path_factory):
         masses={"URDF": pi, "fit": heavier},
         ghosts={"designed </script>": (T, q + 0.3)},
         bands=Bands(T, ["elbow.m", "wrist.m"], ["kg", "kg"], theta, 0.1 + 0 * theta),
-        marks=[Mark(T[0] + 3.0, "payload <b>2 kg</b>", "payload", ur5.joints[2])],
+        marks=[Mark(T[0] + 3.0, "payload <b>2 kg</b>", "payload", ur5.joints[2]),
+               Mark(T[0] + 1.0, "validated", "validation")],
         log="own.csv",
     )  # fmt: skip
     return shown.write(tmp_path_factory.mktemp("page") / "replay.html")
@@ -120,7 +121,7 @@ def test_the_page_loads_and_plays_without_an_error_or_a_request(opened):
     until(seen, "replay.clock.time > 7")
     assert seen.errors == []
     assert seen.requests == []
-    assert seen.page.locator("#marks li").inner_text() == "10.00 s: payload <b>2 kg</b>"
+    assert seen.page.locator("#marks li").last.inner_text() == "10.00 s: payload <b>2 kg</b>"
     assert "ghost: designed </script>" in seen.page.locator("#switches").inner_text()
 
 
@@ -229,10 +230,32 @@ def test_keys_move_the_clock_and_a_mark_is_a_button_that_picks_its_joint(still, 
     assert at() == pytest.approx(11.0)
     seen.page.keyboard.press("Home")
     assert at() == 7.0
-    seen.page.click("#marks button")
+    seen.page.locator("#marks button").last.click()
     assert at() == pytest.approx(10.0)
     assert seen.page.locator("#time").get_attribute("aria-valuetext") == "10.0 of 11.0 seconds"
     assert seen.page.evaluate("replay.picked") == ur5.joints[2]
+
+
+def test_a_changing_time_moves_no_heading_and_reaches_charts_out_of_sight(still):
+    tops = "[...document.querySelectorAll('.plot h3')].map(h => h.getBoundingClientRect().top)"
+    for width in (SMALL[0], 390):
+        with sized(still, width, 800) as seen:
+            places = {str(seen.page.evaluate(f"replay.seek({t}), {tops}")) for t in (7, 8.5, 10.8)}
+            assert len(places) == 1
+    last = "replay.torqueCharts[5].chart"
+    until(seen, f"{last}.at.textContent.startsWith('10.8')")
+    tau = motion(6)[1][np.argmin(np.abs(T - 10.8)), 5]
+    value = seen.page.evaluate(f"{last}.values[0].textContent").replace("−", "-")
+    assert float(value) == pytest.approx(tau, abs=2e-3)
+
+
+def test_a_narrow_page_shows_the_charts_of_one_joint(still):
+    with sized(still, 390, 800) as seen:
+        for node in (0, 4):
+            seen.page.evaluate(f"replay.pick({node})")
+            shown = [plot.locator(".explore").first.is_visible()
+                     for plot in seen.page.locator(".plot").all()]  # fmt: skip
+            assert shown == [j == max(node, 1) - 1 for j in range(6)]
 
 
 def shows(seen, node):
@@ -327,6 +350,7 @@ def test_axe_finds_no_fault(browser, page):
 
     # axe is put in from outside, which the page's own policy forbids
     with visit(browser, page, bypass_csp=True, **OPEN) as seen:
+        assert seen.page.evaluate("replay.clock.time") == 8.0  # at the mark of the validated part
         seen.page.evaluate("replay.pick(3)")
         for scheme, rules in (
             ("light", {"type": "tag", "values": ["wcag2a", "wcag2aa"]}),

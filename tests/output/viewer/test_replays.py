@@ -312,9 +312,9 @@ def test_the_strip_is_of_the_first_prediction_over_what_it_is_compared_to(arm, m
 
 
 @pytest.mark.parametrize(("change", "message"), [
-    (lambda t, q: (t[:5], q), r"t has shape \(5,\) and q \(201, 2\), wanted \(N,\) and \(N, n\)"),
-    (lambda t, q: (t[:1], q[:1]), "the motion has 1 samples, wanted at least 2 to play"),
-    (lambda t, q: (t, q[:, :1]), r"q has shape \(201, 1\), wanted \(N, 2\)"),
+    (lambda t, q: (t[:5], q), r"t has shape \(5,\) and q \(201, 2\), expected \(N,\) and \(N, n\)"),
+    (lambda t, q: (t[:1], q[:1]), "the motion has 1 samples, expected at least 2 to play"),
+    (lambda t, q: (t, q[:, :1]), r"q has shape \(201, 1\), expected \(N, 2\)"),
     (lambda t, q: (t, q * np.nan), "t or q has values that are not finite"),
     (lambda t, q: (np.r_[t[:9], t[8:-1]], q), r"t must increase, but t\[9\] = 5.08 s follows"),
 ])  # fmt: skip

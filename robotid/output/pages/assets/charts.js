@@ -84,6 +84,8 @@ class Link { // a cursor and a range of x that charts share
     if (how !== "hover") this.time = x;
     this.shown = x;
     for (const chart of this.seen) chart.move();
+    clearTimeout(this.rest); // the others when the cursor rests: after Pause, a click, a key
+    this.rest = setTimeout(() => { for (const chart of all) if (chart.link === this) chart.move(); }, 200);
     for (const listener of this.listeners) listener(x, how);
   }
   leave() { this.set(this.time, "hover"); }
@@ -114,8 +116,10 @@ const sight = new IntersectionObserver((entries) => {
 }, { rootMargin: "300px" });
 
 class Chart { // what: as charts.py says; x, y and half are arrays, NaN where there is no number
-  constructor(parent, what) {
+  constructor(parent, what, shared = null) {
     this.what = what;
+    this.shared = shared; // the legend of several charts; its values are those of the last one pointed at
+    this.buttons = [];
     this.link = link(what.link);
     this.hidden = new Set(what.series.flatMap((series, i) => (series.is_hidden ? [i] : [])));
     this.below = what.x_label ? 56 : 36; // [px] that the x axis takes
@@ -144,19 +148,28 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
   }
 
   key(series, i) { // the legend's button of a series; it hides and shows it
+    const known = this.shared && this.shared.get(series.label);
+    if (known) {
+      this.buttons.push(known.button);
+      known.charts.push([this, i]);
+      return known.value;
+    }
+    const charts = [[this, i]];
     const swatch = element("i", { style: `--key: var(--${series.tone})` });
     const value = element("b");
     const button = element("button",
       { type: "button", tabindex: -1, "aria-pressed": !this.hidden.has(i) }, swatch, series.label, value);
-    button.onclick = () => this.toggle(i);
-    this.keys.append(button);
+    button.onclick = () => { for (const [chart, k] of charts) chart.toggle(k); };
+    this.buttons.push(button);
+    (this.shared ? this.shared.keys : this.keys).append(button);
+    if (this.shared) this.shared.set(series.label, { button, value, charts });
     if (series.half) value.className = "wide";
     return value;
   }
 
   toggle(i) {
     if (!this.hidden.delete(i)) this.hidden.add(i);
-    this.keys.querySelectorAll("button")[i].setAttribute("aria-pressed", !this.hidden.has(i));
+    this.buttons[i].setAttribute("aria-pressed", !this.hidden.has(i));
     this.stack();
     if (this.plot) this.plot.setSeries(i + 1, { show: !this.hidden.has(i) });
   }
@@ -253,9 +266,10 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
   }
 
   scale() {
-    this.whole.hidden = !this.link.range;
-    if (!this.plot) return;
     const [min, max] = this.window();
+    this.whole.hidden = !this.link.range;
+    this.at.style.minWidth = `${Math.max(...[min, max].map((x) => this.where(x).length))}ch`;
+    if (!this.plot) return;
     this.plot.setScale("x", { min, max });
     this.move();
   }
@@ -279,7 +293,8 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
         bind: { dblclick: () => () => this.link.zoom(null) } },
       scales: { x: { time: false, distr: distribution("x"), range: () => this.window() },
         y: { distr: distribution("y"), range: () => this.extent() } },
-      axes: [axis({ size: 28, label: name || null, labelSize: name ? 20 : 0, labelGap: 2, space: 70,
+      axes: [axis({ size: 28, label: name || null, labelSize: name ? 20 : 0, labelGap: 2,
+        space: (u, i, low, high) => 36 + 7 * String(Math.trunc(high)).length,
         labelFont: "11px system-ui, sans-serif", ...decades("x") }),
       axis({ size: 54, space: 22, ...decades("y") })],
       series: [{}, ...series.map(({ tone: colour, kind, is_weak: weak }, i) => ({ show: !this.hidden.has(i),
@@ -365,10 +380,10 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     const x = this.link.shown, shown = Number.isFinite(x) && this.x.length > 0;
     this.index = shown ? this.near(x) : -1;
     this.at.textContent = shown ? this.where(this.x[this.index]) : "";
-    this.values.forEach((value, i) => {
-      value.textContent = shown ? this.value(i) : "";
-    });
-    const readings = this.what.series.map((s, i) => `${s.label} ${this.values[i].textContent}`);
+    const values = this.what.series.map((_, i) => (shown ? this.value(i) : ""));
+    if (!this.shared || this.shared.reader === this)
+      this.values.forEach((value, i) => { value.textContent = values[i]; });
+    const readings = this.what.series.map((s, i) => `${s.label} ${values[i]}`);
     this.place.setAttribute("aria-valuenow", shown ? this.x[this.index] : 0);
     this.place.setAttribute("aria-valuetext",
       shown ? `${this.at.textContent}: ${readings.join(", ")}` : "no cursor");
@@ -391,7 +406,14 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     return `${logarithmic.includes("x") ? words(x) : steady(x, to - from)} ${this.unit}`;
   }
 
+  read() { // the shared legend has the values of this chart
+    if (!this.shared || this.shared.reader === this) return;
+    this.shared.reader = this;
+    for (const { value } of this.shared.values()) value.textContent = "";
+  }
+
   under(event) { // x of the row nearest to the pointer
+    this.read();
     const left = event.clientX - this.plot.over.getBoundingClientRect().left;
     return this.x[this.near(this.plot.posToVal(left, "x"))];
   }
@@ -412,6 +434,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
   press(event) {
     const { key, shiftKey } = event;
     if (event.ctrlKey || event.altKey || event.metaKey || !this.x.length) return;
+    this.read();
     const [from, to] = this.window(), log = this.what.logarithmic.includes("x");
     const centre = this.index >= 0 ? this.x[this.index] : (from + to) / 2;
     const step = (shiftKey ? 10 : 1) * (key === "ArrowLeft" ? -1 : 1);
@@ -427,7 +450,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
       this.link.zoom(null);
       this.link.set(NaN, "key");
     } else if (key >= "1" && key <= "9" && key <= this.what.series.length) {
-      this.toggle(Number(key) - 1);
+      this.buttons[Number(key) - 1].click();
     } else return;
     event.preventDefault();
     event.stopPropagation();
@@ -445,6 +468,15 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
 
 // ---- the charts of the page -------------------------------------------------------
 
+const legends = new Map();
+function legend(plots) { // one legend above all charts of a group
+  if (!plots || legends.has(plots)) return legends.get(plots);
+  const keys = element("div", { class: "keys" }), shared = Object.assign(new Map(), { keys, reader: null });
+  plots.before(element("div", { class: "explore shared" }, keys));
+  legends.set(plots, shared);
+  return shared;
+}
+
 for (const figure of document.querySelectorAll("figure.chart")) {
   const what = JSON.parse(figure.querySelector("script").textContent);
   what.x = unpack(what.x);
@@ -452,7 +484,7 @@ for (const figure of document.querySelectorAll("figure.chart")) {
     series.y = unpack(series.y);
     series.half = series.half && unpack(series.half);
   }
-  new Chart(figure, what);
+  new Chart(figure, what, legend(figure.closest(".plots")));
 }
 
 // charts out of sight are drawn when the browser is idle, one at a time; folded ones wait

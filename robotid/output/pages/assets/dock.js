@@ -5,7 +5,7 @@ const PATIENCE = 1500; // [ms] after which a frame that does not answer has no r
 const place = document.getElementById("replay");
 const { file } = place.dataset, clips = JSON.parse(place.dataset.clips);
 const dock = element("aside", { id: "dock", "aria-label": "Replay" });
-const state = element("p", { role: "status" }), command = element("pre", { class: "command" });
+const state = element("p", { role: "status" }), command = element("div");
 let frame = null, opener = null; // the loaded page; where the focus was
 let asked = {}; // time, joint and log of the last link
 let own = []; // the recordings that the replay shows, and their links, once it has answered
@@ -24,6 +24,7 @@ function button(words, act) {
   return made;
 }
 
+const copy = button("Copy", () => window.copyText(command.textContent, copy));
 const reload = button("Reload", () => {
   load(new URLSearchParams(asked).toString());
   describe();
@@ -71,9 +72,8 @@ function describe(isLate = false) {
   else if (isLate) words = `${decodeURI(file)} is missing, or another version of robotid wrote it. This command writes it; then reload.`;
   const needs = isHeard ? isOther : isLate;
   state.textContent = words;
-  const parts = (clip.command || "").split(/((?:'[^']*'|[^\s'])+)/); // arguments between blanks
-  command.replaceChildren(...parts.map((part, k) => (k % 2 ? element("span", {}, part) : part)));
-  command.hidden = !needs || !clip.command;
+  command.innerHTML = clip.command || "";
+  command.hidden = copy.hidden = !needs || !clip.command;
   reload.hidden = isHeard;
   dock.classList.toggle("missing", isLate && !isHeard);
 }
@@ -112,7 +112,7 @@ window.addEventListener("message", ({ source, data }) => {
 
 // ---- links and buttons -----------------------------------------------------------------------
 
-const bar = element("div", { class: "bar" }, state, command, reload,
+const bar = element("div", { class: "bar" }, state, command, copy, reload,
   element("a", { href: file, target: "replay" }, "Open in a tab"), button("Close", close));
 dock.append(bar);
 const opens = place.querySelector("button");

@@ -4,7 +4,8 @@
 const SLOW = 0.045; // [s] a frame
 const READINGS = onProcessor ? 250 : 100; // [ms] between two changes of the page about the view
 const COARSEST = 0.5; // share of the pixels' width that a slow processor draws at least
-const clock = { time: data.start, playing: !matchMedia("(prefers-reduced-motion: reduce)").matches,
+const begin = data.marks.find(({ kind }) => kind === "validation") || { t: data.start };
+const clock = { time: begin.t, playing: !matchMedia("(prefers-reduced-motion: reduce)").matches,
   speed: 1, loop: true, start: data.start, end: 0, frames: 0, at: 0 };
 clock.end = Math.max(motion.end, ...ghostMotions.map(({ end }) => end));
 const slider = byId("time"), clockText = byId("clock"), playButton = byId("play");

@@ -3,6 +3,7 @@
 
 slider.min = clock.start;
 slider.max = clock.end;
+clockText.style.minWidth = `${2 * digits(clock.end).length + 3}ch`; // nothing moves while the time changes
 timeLine.whole = span();
 if (torques) drawTorques();
 if (bands) drawBands();
