@@ -83,13 +83,12 @@ class _Motion:
             gravity, inertia = (x[self.rows, None] for x in (self.gravity, self.inertia))
             X = inertia * (X - weight) + gravity * weight
             urdf = X @ pi - self.subtracted * (weight @ pi)
-        spread = self.spread[self.moved]
         drive = drive_columns(self.model, self.q, self.v, self.a)[:, self.rows]
         level = np.sqrt(np.mean(self.tau**2, axis=0).max())
         drive *= level / (np.sqrt(np.mean(drive**2, axis=0)) + _FLOOR)
         coupled, drive = drive[..., _DRIVE:], drive[..., :_DRIVE]
         logged = np.repeat(self.tau[:, None], len(self.rows), axis=1)
-        bodies = (X * spread)[..., spread > 0.0]
+        bodies = (X * self.spread[self.moved])[..., self.spread[self.moved] > 0.0]
         columns = [bodies, coupled, drive, urdf[..., None], logged]
         P = np.concatenate(columns, axis=2).swapaxes(0, 1)
         edges = np.linspace(0, len(self.tau), self.segments + 1).astype(int).tolist()
@@ -141,12 +140,12 @@ class Samples:
         return replace(self, motion=replace(self.motion, **values))
 
     @property
-    def unsigned(self) -> list[int]:
+    def unsigned(self) -> tuple[int, ...]:
         """The joints of the limb with torques that vary and are never negative."""
         m = self.motion
         low, high = m.tau.min(axis=0), m.tau.max(axis=0)
         is_unsigned = (m.size > 0.0) & (low >= -ZERO * high)
-        return [j for j in m.rows.tolist() if is_unsigned[self.order[j]]]
+        return tuple(j for j in m.rows.tolist() if is_unsigned[self.order[j]])
 
     @cached_property
     def _problem(self) -> tuple[Array, Array]:
@@ -326,8 +325,8 @@ def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
         yield Reading("joint_axis", (j,), partial(_reversed, j=j, on=one[j]))
         if j in turning:
             yield Reading("position_sign", (j,), partial(_mirrored, j=j))
-    for j in samples.unsigned:
-        yield Reading("unsigned_torque", (j,), partial(_signed, j=j))
+    for group in (samples.unsigned, *zip(samples.unsigned, strict=True)):
+        yield Reading("unsigned_torque", group, partial(_signed, joints=group))
     wrists = (tuple(rows[first:]) for first in range(1, len(rows) - 1))
     for group in [tuple(rows), *zip(rows, strict=True), *wrists]:
         gain = samples.gain_without(group)
@@ -413,8 +412,16 @@ def _quarters(model: RobotModel, j: int) -> Iterator[tuple[Array, bool]]:
             yield rotation, is_carried
 
 
-def _signed(samples: Samples, j: int) -> Samples:
-    """Return the samples with the signs of a torque that bodies and drives of the URDF predict."""
+def _signed(samples: Samples, joints: tuple[int, ...]) -> Samples:
+    """Return the samples with the signs of torques that bodies and drives of the URDF predict."""
+    tau = samples.motion.tau.copy()
+    for j in joints:
+        tau[:, samples.order[j]] = _with_sign(samples, j)
+    return samples.changed(tau=tau)
+
+
+def _with_sign(samples: Samples, j: int) -> Array:
+    """Return the torque of a joint with the signs that bodies and drives of the URDF predict."""
     # They are iterated from the signs of the bodies' torque, of v and of a.
     from scipy.optimize import nnls
 
@@ -429,9 +436,7 @@ def _signed(samples: Samples, j: int) -> Samples:
             x, left = nnls(X, sign * size)
             sign = np.where(X @ x < 0.0, -1.0, 1.0)
         tried.append((left, sign))
-    tau = m.tau.copy()
-    tau[:, column] = size * min(tried, key=lambda x: x[0])[1]
-    return samples.changed(tau=tau)
+    return np.asarray(size * min(tried, key=lambda x: x[0])[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -462,18 +467,17 @@ def _best(samples: Samples) -> Best | None:
     fewer = few.changed(spread=spread)  # parameters: masses and first moments
     every = enumerate(readings(fewer, bool(few.share.max() > _GROSS)))
     gains = [(misfit(fewer.share) - misfit(r.of(fewer).share), i, r) for i, r in every]
-    tried = sorted((x for x in gains if x[0] > 0.5 * CERTAIN), key=lambda x: -x[0])[:_TRIED]
+    tried = sorted((x for x in gains if x[0] > _ALIKE), key=lambda x: -x[0])[:_TRIED]
     refined = [(reading.refined(few, 8), i) for _, i, reading in tried]
     left = {r: (misfit(r.of(samples).share), len(r.joints), i) for r, i in refined}
-    least = min(left.values(), default=(0.0,))[0] + _ALIKE
-    starts = {(r.code, r.joints): r for r in sorted(left, key=lambda r: left[r], reverse=True)}
-    close = [r for r in starts.values() if left[r][0] < least]
-    alike = sorted(close, key=lambda r: left[r][1:])  # the simplest first
-    if not alike:
+    if not left:
         return None
+    starts = {(r.code, r.joints): r for r in sorted(left, key=lambda r: left[r], reverse=True)}
+    close = [r for r in starts.values() if left[r][0] < min(left.values())[0] + _ALIKE]
+    alike = sorted(close, key=lambda r: left[r][1:])  # the simplest first
     best = alike[0].refined(few, 20)
     read = best.of(samples)
     gain = misfit(samples.held_out) - misfit(read.held_out)
-    if min(gain, misfit(samples.share) - misfit(read.share)) < CERTAIN:
+    if gain < CERTAIN or misfit(samples.share) - misfit(read.share) < _ALIKE:
         return None
     return Best(best, tuple(alike[1:]), read, gain, samples.unexplained, read.unexplained)

@@ -37,7 +37,7 @@ _COLUMNS = (
 _UNCHECKED = {
     "unread": "Not checked, because no shape of these links can be read",
     "left_alone": "Not checked, because these links touch by design",
-    "built_near": "These links are close by design; half of their median distance is their clearance",
+    "built_near": "These links are close by design; half their median distance is their clearance",
 }
 _NAMED = 5  # base parameters with the largest expected standard errors that are named
 _SHARP = 0.1  # share of the plausible range below which one is well determined ...
