@@ -478,6 +478,6 @@ def _best(samples: Samples) -> Best | None:
     best = alike[0].refined(few, 20)
     read = best.of(samples)
     gain = misfit(samples.held_out) - misfit(read.held_out)
-    if gain < CERTAIN or misfit(samples.share) - misfit(read.share) < _ALIKE:
+    if min(gain, misfit(samples.share) - misfit(read.share)) < CERTAIN:
         return None
     return Best(best, tuple(alike[1:]), read, gain, samples.unexplained, read.unexplained)
