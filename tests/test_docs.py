@@ -168,7 +168,7 @@ def follow(tmp_path, monkeypatch, capsys):
             is_error = bool(nearest) and nearest[2].lstrip().startswith("error:")
             for line in as_lines(block) if language == "bash" else ():
                 if line.startswith("robotid "):
-                    brief = "excite --starts 1 --points 20"
+                    brief = "excite --starts 1 --seconds 0.5 --points 20"
                     words = shlex.split(line.replace("--starts 1 ", "").replace("excite", brief))
                     assert (main(words[1:]) == 1) == is_error, line
                 else:

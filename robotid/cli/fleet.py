@@ -43,6 +43,7 @@ from robotid.estimation.variation.variation import FALSE_ALARMS, between_units
 from robotid.estimation.work_plan import Workload, WorkPlan
 from robotid.output.files.entries import build_result
 from robotid.output.report.comparison import fleet_page
+from robotid.output.report.report_content import report_html
 
 #: Columns of the table.
 COLUMNS = {
@@ -188,11 +189,11 @@ def _unit(
     return FleetUnit(name, logs, *files)
 
 
-def identify_unit(unit: FleetUnit, threads: int | None) -> UnitRows:
-    """Identify a unit; a failure is a row of its result."""
+def identify_unit(unit: FleetUnit, threads: int | None) -> tuple[UnitRows, str]:
+    """Identify a unit: rows of its result, of which a failure is one, and its report or ""."""
     del threads
     refused: dict[Path, str] = {}
-    rows: UnitRows = []
+    rows, html = UnitRows(), ""
     try:
         job = unit.stated()
         identification = identify_job(
@@ -202,13 +203,14 @@ def identify_unit(unit: FleetUnit, threads: int | None) -> UnitRows:
         result = build_result(identification, job.to_dict())
         used = [e.path for e in job.identification if e.path not in refused]
         rows += _rows(unit.unit, used, result)
+        html = report_html(identification)
     except Exception as error:  # the fleet goes on: the error is in the table, with its type
         rows = [_failure(unit, error)]
     rows += [
         {"unit": unit.unit, "log": str(path), "status": "failed", "error": error}
         for path, error in refused.items()
     ]
-    return rows
+    return rows, html
 
 
 def _failure(unit: FleetUnit, error: Exception) -> dict[str, Any]:
@@ -251,10 +253,12 @@ def run_fleet(
     missing = [unit for unit in units if not stored[unit.unit].exists()]
     failed: dict[str, UnitRows] = {}
     with plan:
-        for k, rows in plan.as_finished(
+        for k, (rows, html) in plan.as_finished(
             identify_unit, missing, "identifying", counted="logs",
-            lost=lambda unit, error: [_failure(unit, error)],
+            lost=lambda unit, error: ([_failure(unit, error)], ""),
         ):  # fmt: skip
+            if html:
+                write_text(html, stored[missing[k].unit].with_suffix(".html"))
             if any(row["status"] == "failed" for row in rows):
                 failed[missing[k].unit] = rows
             else:
@@ -265,7 +269,8 @@ def run_fleet(
             def results() -> Iterator[Mapping[str, Any]]:  # one after the other: not all in memory
                 for unit in units:
                     rows = failed.get(unit.unit) or read_json(stored[unit.unit], "unit's result")
-                    gathered.add(rows)
+                    report = stored[unit.unit].with_suffix(".html")
+                    gathered.add(rows, f"{UNITS}/{report.name}" if report.exists() else "")
                     yield from rows
 
             write_rows(partial / TABLE, results(), _RESULTS)
@@ -299,8 +304,9 @@ class _Gathered:
         self._values = defaultdict[tuple[str, ...], list[tuple[str, float, float]]](list)
         self._failures: list[dict[str, str]] = []
         self._verdicts = Counter[str]()
+        self._units: list[dict[str, str]] = []
 
-    def add(self, rows: UnitRows) -> None:
+    def add(self, rows: UnitRows, report: str) -> None:
         for row in rows:
             if row["status"] == "failed":
                 shown = {"unit": row["unit"], "log": row.get("log", ""), "error": row["error"]}
@@ -308,7 +314,12 @@ class _Gathered:
             elif "log" not in row and row.get("std_error"):
                 key = row["robot"], row["parameter"], row["expression"], row["parameter_unit"]
                 self._values[key].append((row["unit"], row["value"], row["std_error"]))
-        self._verdicts.update([row["verdict"] for row in rows if row.get("verdict")][:1])
+        judged = next((row for row in rows if row.get("verdict")), {})
+        verdict, texts = judged.get("verdict", "failed"), [row.get("error") for row in rows]
+        reason = "; ".join(filter(None, [*texts, judged.get("reasons")]))
+        unit = {"unit": rows[0]["unit"], "verdict": verdict, "reason": reason, "report": report}
+        self._units.append(unit)
+        self._verdicts.update([verdict] * bool(judged))
 
     def content(self, units: Sequence[FleetUnit]) -> dict[str, Any]:
         several = {key: rows for key, rows in self._values.items() if len(rows) >= FEWEST_RUNS}
@@ -337,7 +348,7 @@ class _Gathered:
         return {
             "units": len(units), "logs": sum(len(unit.logs) for unit in units),
             "done": sum(self._verdicts.values()), "verdicts": dict(self._verdicts),
-            "failures": self._failures, "parameters": parameters,
+            "results": self._units, "failures": self._failures, "parameters": parameters,
             "unlike": sorted(unlike, key=lambda entry: entry["probability"]),
         }  # fmt: skip
 

@@ -1,6 +1,7 @@
 """A fleet: the table, results of units, failures, resumed runs with the same bits, the page."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 
@@ -87,9 +88,17 @@ def test_a_failure_is_a_row_and_the_others_are_identified(done, table):
     unit, log = rows_of(folder, unit="d")
     assert unit["error"].startswith("DataError: no log is usable")
     assert "none.csv" in log["error"]
-    page = tables((folder / "fleet.html").read_text())
-    shown = page["Units and logs that were not identified"].rows
-    assert [row[0] for row in shown] == ["a", "d", "d"]
+    html = (folder / "fleet.html").read_text()
+    page = tables(html)
+    found = page["Units, the worst first"].rows
+    assert [row[:2] for row in found] == [
+        ["d", "failed"], ["b", "usable"], ["c", "usable"], ["a", "good"]
+    ]  # fmt: skip
+    assert found[3][2].startswith("there is no log file")
+    reports = re.findall(r'<a href="(.*?)">report</a>', html)
+    heads = [re.search("<title>(.*?)</title>", (folder / x).read_text())[1] for x in reports]
+    assert heads == 3 * ["planar_2r: identified parameters"]
+    assert [x["unit"] for x in content["failures"]] == ["a", "d", "d"]
     assert sum(content["verdicts"].values()) == 3
 
 
@@ -126,7 +135,7 @@ def test_a_unit_is_identified_again_if_an_input_changes(table, tmp_path, monkeyp
         run_fleet([unit], tmp_path / "out", plan=WorkPlan(), resume=True)
         return bool(repeated)
 
-    rows = [{"unit": "u", "status": "done"}]
+    rows = [{"unit": "u", "status": "done", "verdict": "good"}], ""
     monkeypatch.setattr(fleet, "identify_unit", lambda unit, _: repeated.append(unit) or rows)
     assert [is_repeated(unit), is_repeated(unit)] == [True, False]
     assert is_repeated(replace(unit, logs=((log, None), (other, 2.0))))

@@ -38,9 +38,9 @@ Column = tuple[str, str, str]
 
 
 @cache
-def asset(name: str) -> str:
+def asset(name: str, folder: Path = _ASSETS) -> str:
     """Return the text of an asset file."""
-    return (_ASSETS / name).read_text(encoding="utf-8")
+    return (folder / name).read_text(encoding="utf-8")
 
 
 def block(key: str, /, **values: object) -> str:
@@ -204,10 +204,7 @@ def facts_html(facts: Mapping[str, str], files: Mapping[str, str] | None = None)
 
 
 def command_html(block: str) -> str:
-    """Return the HTML of a command, or of lines of a job file; lines break between arguments.
-
-    Folders of absolute paths are not visible, but are copied.
-    """
+    """Return the HTML of a command, or of lines of a job file; absolute folders are hidden."""
     html = escape(block)
     if block.startswith("robotid ") and "\n" not in block:  # an argument does not end at a hyphen
         words = [_FOLDERS.sub(r"<i>\1</i>", escape(word)) for word in arguments(block)]

@@ -1,12 +1,13 @@
 """Comparison of results, from their result.json files only, or of the units of a fleet: pages."""
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from html import escape
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from robotid.base.exceptions import DataError
 from robotid.base.files import check_file, write_text
@@ -16,8 +17,11 @@ from robotid.diagnosis.decisions import BEYOND_NOISE
 from robotid.output.files.result_file import load_result
 from robotid.output.pages.html import (
     Cell,
+    Chart,
     Column,
+    Series,
     block,
+    chart_html,
     code,
     facts_html,
     listing,
@@ -27,7 +31,7 @@ from robotid.output.pages.html import (
     text,
     with_error,
 )
-from robotid.output.report.tables import both
+from robotid.output.report.tables import POSITION, TORQUE, both
 from robotid.robot.drives import TERMS
 
 _FILES = ("urdf", "identification", "validation")  # settings that are shown as inputs
@@ -285,8 +289,8 @@ def comparison_page(content: Mapping[str, Any]) -> str:
     sections = {
         "errors": ("Prediction errors", _errors_section(content)),
         "settings": ("Different settings", _differing(content, "settings", "setting")),
-        "base": ("Base parameters", _base_section(content)),
-        "inputs": ("Inputs", _inputs_section(content)),
+        "base": ("Base parameters", _base_section(content), "the largest differences first", False),
+        "inputs": ("Inputs", _inputs_section(content), "files read", False),
         "versions": ("Different versions", _differing(content, "versions", "package")),
     }
     return page(title, f"<h1>{escape(title)}</h1>\n{''.join(map(_verdict, results))}", sections)
@@ -324,7 +328,9 @@ def _errors_section(content: Mapping[str, Any]) -> str:
     tables += _error_table("Fitted samples of each result", content, content["fitted"], are_alike)
     notes = "".join(f"<li>{escape(note)}</li>" for note in content["notes"])
     notes = f"<ul>{notes}</ul>\n" if notes else ""
-    return block("comparison.errors", notes=notes, tables=tables)
+    units = {entry["unit"] for entry in content["fitted"]}
+    share = (TORQUE if units.isdisjoint(("rad", "m")) else POSITION).share
+    return block("comparison.errors", notes=notes, tables=tables, share=share)
 
 
 def _error_table(
@@ -401,10 +407,10 @@ def _inputs_section(content: Mapping[str, Any]) -> str:
 
 # ---- the page of a fleet --------------------------------------------------------------------
 
-_ROWS = 20  # failures on the page, and units that differ; all are in the files of results
-_FAILURES = (
-    ("unit", "code", "unit"), ("log", "code", "log"), ("alike", "d", "alike"),
-    ("error", "text", "error"),
+_ORDER = ("failed", "poor", "usable", "good")
+_UNITS = (
+    ("unit", "code", "unit"), ("verdict", "text", "verdict"), ("reason", "text", "reason"),
+    ("report", "text", "report"),
 )  # fmt: skip
 _UNLIKE = (
     ("unit", "code", "unit"), ("parameter", "code", "parameter"), ("value", ".4g", "value"),
@@ -429,37 +435,37 @@ def fleet_page(content: Mapping[str, Any]) -> str:
         "Units that differ": str(len({entry["unit"] for entry in unlike})),
     }
     sections = {
-        "failures": ("Failures", _failures(content)),
+        "units": ("Units", _units(content)),
         "unlike": ("Units that differ", _unlike(content)),
         "parameters": ("Variation between units", _parameters(content)),
+        "values": ("Distributions", _distributions(content), "units by parameter", False),
     }
     title = f"Fleet of {content['units']} units"
     return page(title, f"<h1>{title}</h1>\n{facts_html(facts)}", sections)
 
 
-def _failures(content: Mapping[str, Any]) -> str:
-    failures = content["failures"]
-    kinds = [_kind(failure) for failure in failures]
-    count, first = Counter(kinds), {kind: k for k, kind in reversed([*enumerate(kinds)])}
-    order = sorted(range(len(kinds)), key=lambda k: (first[kinds[k]] != k, k))
-    rows = [
-        failures[k] | {"log": failures[k]["log"] or "all", "alike": count[kinds[k]]}
-        for k in order[:_ROWS]
-    ]
-    table = listing("Units and logs that were not identified", _FAILURES, rows)
-    return table + _more(len(failures), "fleet.parquet") if table else "<p>None.</p>\n"
+def _units(content: Mapping[str, Any]) -> str:
+    rows, differing = [], {entry["unit"] for entry in content["unlike"]}
+    alike_last = sorted(content["results"], key=lambda x: x["unit"] not in differing)
+    for entry in sorted(alike_last, key=lambda x: _ORDER.index(x["verdict"])):
+        names = [x["parameter"] for x in content["unlike"] if x["unit"] == entry["unit"]]
+        words = f"differs from the other units in {listed(names)}; " * bool(names)
+        link = f'<a href="{escape(entry["report"])}">report</a>' if entry["report"] else "–"
+        verdict = text(entry["verdict"], flag=entry["verdict"] in _ORDER[:2])
+        shown = {"verdict": verdict, "reason": words + entry["reason"]}
+        rows.append(entry | shown | {"report": Cell(link, "text")})
+    return listing("Units, the worst first", _UNITS, rows, is_data=True)
 
 
-def _kind(failure: Mapping[str, str]) -> str:
-    """Return the error without the names of its unit and log."""
-    kind = failure["error"]
-    for name in (failure["log"], PurePath(failure["log"]).name, failure["unit"]):
-        kind = kind.replace(name, "") if name else kind
-    return kind
-
-
-def _more(count: int, file: str) -> str:
-    return block("fleet.more", count=count - _ROWS, file=file) if count > _ROWS else ""
+def _distributions(content: Mapping[str, Any]) -> str:
+    figures = "" if content["parameters"] else "<p>None.</p>\n"
+    for entry in content["parameters"]:
+        counts, edges = np.histogram(entry["values"], "auto")
+        units = Series("units", np.repeat(counts, 2).astype(float), "tone-1", "area")
+        name, x = f"{entry['name']} [{entry['unit']}]", np.repeat(edges, 2)[1:-1]
+        chart = Chart(f"Units by {name}", x, (units,), name, "units", height=90)
+        figures += chart_html(chart, f"<strong>{code(entry['name']).html}</strong>")
+    return f'<div class="plots small">\n{figures}</div>\n'
 
 
 def _with_errors(entry: Mapping[str, Any], value: str, ends: str) -> dict[str, Any]:
@@ -470,10 +476,9 @@ def _with_errors(entry: Mapping[str, Any], value: str, ends: str) -> dict[str, A
 
 
 def _unlike(content: Mapping[str, Any]) -> str:
-    rows = [_with_errors(entry, "value", "others") for entry in content["unlike"][:_ROWS]]
+    rows = [_with_errors(entry, "value", "others") for entry in content["unlike"]]
     table = listing("Units that differ from the others", _UNLIKE, rows, is_data=True)
-    more = _more(len(content["unlike"]), "fleet.json")
-    return block("fleet.unlike") + table + more if table else "<p>None.</p>\n"
+    return block("fleet.unlike") + table if table else "<p>None.</p>\n"
 
 
 def _parameters(content: Mapping[str, Any]) -> str:

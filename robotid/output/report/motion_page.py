@@ -37,7 +37,7 @@ _COLUMNS = (
 _UNCHECKED = {
     "unread": "Not checked, because no shape of these links can be read",
     "left_alone": "Not checked, because these links touch by design",
-    "built_near": "These links are close by design; half their median distance is their clearance",
+    "built_near": "Close by design, with half of their median distance as clearance",
 }
 _NAMED = 5  # base parameters with the largest expected standard errors that are named
 _SHARP = 0.1  # share of the plausible range below which one is well determined ...
@@ -65,16 +65,13 @@ def _head(model: RobotModel, content: Mapping[str, Any]) -> str:
     condition, how = content["condition_number"], f"{content['seconds']:.1f} s"
     if content["starts"]:
         settled = "converged" if content["converged"] else "not converged: allow more seconds"
-        plural = "start" if content["starts"] == 1 else "starts"
-        how += f", {content['starts']} {plural}, {settled}"
-    words = "infinite"
-    if condition is not None:
-        words = f"{condition:,.0f} (regressor, columns in units of the prior)"
+        how += f", {content['starts']} start{'s' * (content['starts'] != 1)}, {settled}"
+    columns = "(regressor, columns in units of the prior)"
     facts = {
         "motion": f"{content['kind']}, {content['duration']:.4g} s",
         "joints": f"{len(model.joints)}",
         "criterion": content["criterion"],
-        "condition number": words,
+        "condition number": "infinite" if condition is None else f"{condition:,.0f} {columns}",
         "computing time": how,
     }
     html = facts_html({name: escape(value) for name, value in facts.items()})
@@ -104,10 +101,10 @@ def _collisions(content: Mapping[str, Any], course: Course) -> str:
     entry, contact = content["limits"].get("collision"), course.nearest
     if entry is None or course.clearance is None:
         return "<p>Collisions were not checked.</p>\n"
-    html = "<p>No two links can collide.</p>\n"
+    html, where = "<p>No two links can collide.</p>\n", entry["where"]
     if entry["margin"] is not None:
-        where, time, required = entry["where"], entry["time"], entry["kept"]
-        html = _nearest(where, entry["margin"] + required, time, required, ", also between samples")
+        required, between = entry["kept"], ", also between samples"
+        html = _nearest(where, entry["margin"] + required, entry["time"], required, between)
     elif contact is not None:
         where = f"{contact.first} and {contact.second}"
         html = _nearest(where, contact.distance, contact.time, contact.required)

@@ -228,10 +228,8 @@ class Dock:
             clip._asdict() | {"log": Path(clip.log).name, "command": self._command(clip)}
             for clip in self.clips
         ]
-        kind, command = "written", ""
-        if not self.replay:
-            kind = "unwritten"
-            command = next(filter(None, map(self._command, self.clips)))
+        kind = "written" if self.replay else "unwritten"
+        command = "" if self.replay else next(filter(None, map(self._command, self.clips)))
         file, packed = escape(quote(self.file)), escape(json.dumps(clips))
         return block(f"report.{kind}_dock", file=file, clips=packed, command=command)
 
@@ -348,21 +346,22 @@ _SELECTED = (
 )  # fmt: skip
 
 
-def write_report(
-    found: Identification,
-    target: str | Path,
-    *,
-    files: Mapping[str, str] | None = None,
-    origin: Origin | None = None,
-) -> Path:
-    """Write the report of an identification as one HTML file, with links to files by their kind."""
+def write_report(found: Identification, target: str | Path, **options: Any) -> Path:  # noqa: ANN401
+    """Write the report of an identification as one HTML file."""
+    return write_text(report_html(found, **options), target)
+
+
+def report_html(
+    found: Identification, files: Mapping[str, str] | None = None, origin: Origin | None = None
+) -> str:
+    """Return the HTML of the report of an identification, with links to files by their kind."""
     at, links = origin or Origin(), files or {}
     replay = links.get("replay", "")
     if isinstance(found, TorqueIdentification):
         report = torque_report(found, at, replay)
     else:
         report = position_report(cast("PositionIdentification", found), at, replay)
-    return write_text(page_of(found, report, at, links), target)
+    return page_of(found, report, at, links)
 
 
 def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "") -> Report:

@@ -173,12 +173,11 @@ def error_bars(
     if more:
         words = f"{len(items) - VISIBLE} more joints with smaller errors"
         more = f"<details><summary>{words}</summary><ol>{more}</ol></details>\n"
-    fitted = "fitted samples, without validation log"
     return block(
         "report.bars",
         title=quantity.title,
         share=quantity.share,
-        kind=fitted if recordings[0].is_fitted else "not fitted",
+        kind="fitted samples, without validation log" if recordings[0].is_fitted else "not fitted",
         legend=_legend(quantity, {key for m in worst.values() for key in _others(quantity, m)}),
         bars="".join(items[:VISIBLE]),
         more=more,
@@ -426,8 +425,7 @@ def consistency_section(identification: TorqueIdentification) -> str:
     for key, words in _CONSTRAINTS.items():
         if key in details:
             notes.append(f"{words}: {listed(details[key])}.")
-    is_consistent = identification.is_consistent
-    every = "All bodies and drives are" if is_consistent else "Not all bodies and drives are"
+    every = "All" if identification.is_consistent else "Not all"
     return block("report.consistency", all=every, notes=paragraphs(notes))
 
 

@@ -693,8 +693,9 @@ def page(data: Mapping[str, Any]) -> str:
     """Return the page of a replay. It loads nothing."""
     title = f"{data['title']}: replay"
     policy = "; script-src 'unsafe-inline'; img-src data: blob:"
-    style = f"{asset('uPlot.min.css')}\n/*tones*/{asset('charts.css')}{_asset('replay.css')}"
-    body = Template(_asset("replay.html")).substitute(
+    styles = asset("charts.css") + asset("replay.css", _ASSETS)
+    style = f"{asset('uPlot.min.css')}\n/*tones*/{styles}"
+    body = Template(asset("replay.html", _ASSETS)).substitute(
         title=escape(title),
         notes=" ".join(f"<p>{escape(note)}</p>" for note in data["notes"]),
         data=script_json(data),
@@ -708,13 +709,8 @@ def page(data: Mapping[str, Any]) -> str:
 
 
 @cache
-def _asset(name: str) -> str:
-    return (_ASSETS / name).read_text(encoding="utf-8")
-
-
-@cache
 def _script() -> str:
-    sections = "".join(_asset(f"{name}.js") for name in _SCRIPTS)
+    sections = "".join(asset(f"{name}.js", _ASSETS) for name in _SCRIPTS)
     return f'"use strict";\n(() => {{\n{sections}}})();\n'
 
 

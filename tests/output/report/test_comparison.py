@@ -19,7 +19,12 @@ from robotid.data.files.read import write_log
 from robotid.output.files.result_file import read_result
 from robotid.output.pages.html import page
 from robotid.output.report import comparison
-from robotid.output.report.comparison import compare_results, fleet_page, write_comparison
+from robotid.output.report.comparison import (
+    compare_results,
+    comparison_page,
+    fleet_page,
+    write_comparison,
+)
 from robotid.robot.model import RobotModel
 
 
@@ -104,6 +109,11 @@ def test_parameters_far_apart_stand_first_and_are_counted(folder, tmp_path):
     assert table.rows[0][0] == last["name"]
     far = sum(abs(float(row[1].replace("−", "-"))) > 3.0 for row in table.rows)
     assert f"{far} of {len(table.rows)} parameters differ from A by more than 3 combined" in html
+    assert "error = 100 |τ − prediction| / |τ| over" in html
+    content = compare_results([folder / "a.json", tmp_path / "b.json"])
+    positions = [entry | {"unit": "rad"} for entry in content["fitted"]]
+    html = comparison_page(content | {"fitted": positions})
+    assert "error = 100 |q − simulated| / |motion| over" in html
 
 
 def test_results_and_logs_of_one_name_are_told_apart_by_the_shortest_path(folder, tmp_path):
@@ -127,16 +137,17 @@ def test_results_and_logs_of_one_name_are_told_apart_by_the_shortest_path(folder
     assert [x["name"] for x in compare_results(places[:2])["results"]] == ["monday", "tuesday"]
 
 
-def test_the_failures_of_a_fleet_are_counted_and_the_first_of_each_kind_stand_first():
-    said = [("a", "", "a: no torque"), ("b", "b.csv", "b.csv: no torque"), ("c", "", "c: no URDF"),
-            ("d", "", "d: no torque")]  # fmt: skip
-    failures = [dict(zip(("unit", "log", "error"), words, strict=True)) for words in said]
-    content = {"failures": failures, "unlike": [], "parameters": [], "done": 0, "units": 4,
-               "logs": 4, "verdicts": {}}  # fmt: skip
-    shown = tables(fleet_page(content))["Units and logs that were not identified"]
-    assert shown.rows == [
-        ["a", "all", "3", "a: no torque"], ["c", "all", "1", "c: no URDF"],
-        ["b", "b.csv", "3", "b.csv: no torque"], ["d", "all", "3", "d: no torque"],
+def test_units_that_failed_stand_before_those_that_differ():
+    verdicts = {"a": "good", "b": "usable", "c": "usable", "d": "failed"}
+    results = [{"unit": unit, "verdict": verdict, "reason": "why", "report": f"{unit}.html"}
+               for unit, verdict in verdicts.items()]  # fmt: skip
+    unlike = {"unit": "c", "parameter": "x", "value": 1.0, "std_error": 0.1, "others": (2.0, 3.0)}
+    content = {"failures": [], "unlike": [unlike | {"parameter_unit": "kg"}], "parameters": [],
+               "results": results, "done": 3, "units": 4, "logs": 4, "verdicts": {}}  # fmt: skip
+    assert tables(fleet_page(content))["Units, the worst first"].rows == [
+        ["d", "failed", "why", "report"],
+        ["c", "usable", "differs from the other units in x; why", "report"],
+        ["b", "usable", "why", "report"], ["a", "good", "why", "report"],
     ]  # fmt: skip
 
 
