@@ -7,7 +7,7 @@ drives. Shapes: q (N, n), v and a (N, n_rows).
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from itertools import pairwise
 from types import ModuleType
 from typing import NamedTuple
@@ -337,8 +337,7 @@ class InertialRows:
 
 def inertial_rows(model: RobotModel, q: Array, v: Array, a: Array) -> InertialRows:
     """Return the inertial columns that affect each row; of many joints they are few."""
-    columns = _inertial_support(model)
-    plan = plan_rows(model.layout, columns)
+    plan = _inertial_plan(model)
     out = np.empty((plan.first[-1], min(BLOCK, len(q))))
     writer, places = _PinocchioWriter(model, plan, out), np.concatenate(plan.places)
     values = np.empty((len(places), len(q)))
@@ -346,7 +345,7 @@ def inertial_rows(model: RobotModel, q: Array, v: Array, a: Array) -> InertialRo
         k = slice(start, min(start + BLOCK, len(q)))
         writer.write_inertial(q[k], v[k], a[k])
         values[:, k] = out[places, : k.stop - k.start]
-    return InertialRows(model.pin_model, columns, values)
+    return InertialRows(model.pin_model, tuple(plan.inertial), values)
 
 
 def keep_inertial_rows(model: RobotModel, trajectory: Trajectory) -> None:
@@ -358,6 +357,12 @@ def keep_inertial_rows(model: RobotModel, trajectory: Trajectory) -> None:
         return
     rows = inertial_rows(model, trajectory.q, trajectory.v, trajectory.a)
     trajectory.derived["inertial rows"] = rows
+
+
+@lru_cache(maxsize=2)  # for many short motions of one robot
+def _inertial_plan(model: RobotModel) -> RowPlan:
+    """Return the plan of rows with inertial columns alone."""
+    return plan_rows(model.layout, _inertial_support(model))
 
 
 def _inertial_support(model: RobotModel) -> tuple[Array, ...]:

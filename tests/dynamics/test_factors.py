@@ -176,6 +176,9 @@ def test_what_is_asked_of_factors_is_what_their_dense_rows_say(rng):
         for level, (W, tau, _) in zip(sigma, rows, strict=True)
     )
     np.testing.assert_allclose(gram(factors.weighted(sigma)), whole, atol=1e-9)
+    R, residual = factors.weighted_rows(theta, sigma)
+    rows = np.column_stack([R, residual + R @ theta])
+    np.testing.assert_allclose(gram(rows), whole, atol=1e-9)
 
 
 def test_a_problem_of_two_logs_has_the_columns_of_both(rng):

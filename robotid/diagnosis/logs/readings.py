@@ -35,7 +35,7 @@ _LOOSE = 10.0  # prior deviation of the bodies, in sizes of the URDF's
 _FEW = 24  # instants with which the readings are chosen that are tried with all
 _SEGMENTS = 8  # of the log that are held out in turn
 _BODIES = 20  # of a limb, at most
-_TRIED = 5  # readings that are tried with all instants
+_TRIED = 10  # readings that are tried with all instants
 _TILT = 0.35  # tangent of the angle of a base that is not level
 _OFFSET = 0.4  # [rad] of a zero position
 _DRIVE = 4  # columns of a drive: offset, armature, viscous and Coulomb friction
@@ -88,7 +88,8 @@ class _Motion:
         drive *= level / (np.sqrt(np.mean(drive**2, axis=0)) + _FLOOR)
         coupled, drive = drive[..., _DRIVE:], drive[..., :_DRIVE]
         logged = np.repeat(self.tau[:, None], len(self.rows), axis=1)
-        columns = [X * self.spread[self.moved], coupled, drive, urdf[..., None], logged]
+        bodies = (X * self.spread[self.moved])[..., self.spread[self.moved] > 0.0]
+        columns = [bodies, coupled, drive, urdf[..., None], logged]
         P = np.concatenate(columns, axis=2).swapaxes(0, 1)
         edges = np.linspace(0, len(self.tau), self.segments + 1).astype(int).tolist()
         parts = [P[:, i:k] for i, k in pairwise(edges)]
@@ -102,15 +103,11 @@ class _Motion:
 
     def inertial(self) -> Array:
         """Return the columns of the limb's bodies, shape (N, m, p)."""
-        v, a = self.clock * self.v, self.clock**2 * self.a
-        rows, bodies = np.nonzero(self.model.support[:, : len(self.spread) : 10])
-        row = np.full(v.shape[1], -1)
-        row[self.rows] = np.arange(len(self.rows))
-        own = row[rows] >= 0
-        values = inertial_rows(self.model, self.q, v, a).values.T.reshape(len(v), -1, 10)
-        columns = np.zeros((len(v), len(self.rows), len(self.spread) // 10, 10))
-        columns[:, row[rows[own]], bodies[own]] = values[:, own]
-        return columns.reshape(*columns.shape[:2], -1)[..., self.moved]
+        every = inertial_rows(self.model, self.q, self.clock * self.v, self.clock**2 * self.a)
+        X = np.zeros((len(self.q), len(self.rows), len(self.spread)))
+        for k, j in enumerate(self.rows):
+            X[:, k, every.columns[j]] = every.values[every.first[j] : every.first[j + 1]].T
+        return X[..., self.moved]
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,12 +140,12 @@ class Samples:
         return replace(self, motion=replace(self.motion, **values))
 
     @property
-    def unsigned(self) -> list[int]:
+    def unsigned(self) -> tuple[int, ...]:
         """The joints of the limb with torques that vary and are never negative."""
         m = self.motion
         low, high = m.tau.min(axis=0), m.tau.max(axis=0)
         is_unsigned = (m.size > 0.0) & (low >= -ZERO * high)
-        return [j for j in m.rows.tolist() if is_unsigned[self.order[j]]]
+        return tuple(j for j in m.rows.tolist() if is_unsigned[self.order[j]])
 
     @cached_property
     def _problem(self) -> tuple[Array, Array]:
@@ -328,8 +325,8 @@ def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
         yield Reading("joint_axis", (j,), partial(_reversed, j=j, on=one[j]))
         if j in turning:
             yield Reading("position_sign", (j,), partial(_mirrored, j=j))
-    for j in samples.unsigned:
-        yield Reading("unsigned_torque", (j,), partial(_signed, j=j))
+    for group in (samples.unsigned, *zip(samples.unsigned, strict=True)):
+        yield Reading("unsigned_torque", group, partial(_signed, joints=group))
     wrists = (tuple(rows[first:]) for first in range(1, len(rows) - 1))
     for group in [tuple(rows), *zip(rows, strict=True), *wrists]:
         gain = samples.gain_without(group)
@@ -415,8 +412,16 @@ def _quarters(model: RobotModel, j: int) -> Iterator[tuple[Array, bool]]:
             yield rotation, is_carried
 
 
-def _signed(samples: Samples, j: int) -> Samples:
-    """Return the samples with the signs of a torque that bodies and drives of the URDF predict."""
+def _signed(samples: Samples, joints: tuple[int, ...]) -> Samples:
+    """Return the samples with the signs of torques that bodies and drives of the URDF predict."""
+    tau = samples.motion.tau.copy()
+    for j in joints:
+        tau[:, samples.order[j]] = _with_sign(samples, j)
+    return samples.changed(tau=tau)
+
+
+def _with_sign(samples: Samples, j: int) -> Array:
+    """Return the torque of a joint with the signs that bodies and drives of the URDF predict."""
     # They are iterated from the signs of the bodies' torque, of v and of a.
     from scipy.optimize import nnls
 
@@ -431,9 +436,7 @@ def _signed(samples: Samples, j: int) -> Samples:
             x, left = nnls(X, sign * size)
             sign = np.where(X @ x < 0.0, -1.0, 1.0)
         tried.append((left, sign))
-    tau = m.tau.copy()
-    tau[:, column] = size * min(tried, key=lambda x: x[0])[1]
-    return samples.changed(tau=tau)
+    return np.asarray(size * min(tried, key=lambda x: x[0])[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -460,18 +463,18 @@ def _best(samples: Samples) -> Best | None:
     few = samples.few()
     if few.share.max() < _POOR:
         return None
-    gains: dict[tuple[str, tuple[int, ...]], tuple[float, int, Reading]] = {}
-    for i, reading in enumerate(readings(few, bool(few.share.max() > _GROSS))):
-        gain = misfit(few.share) - misfit(reading.of(few).share)
-        if gain > gains.get((reading.code, reading.joints), (0.5 * CERTAIN,))[0]:
-            gains[reading.code, reading.joints] = gain, i, reading
-    tried = sorted(gains.values(), key=lambda x: -x[0])[:_TRIED]
+    spread = np.where(np.arange(len(few.motion.spread)) % 10 < 4, few.motion.spread, 0.0)
+    fewer = few.changed(spread=spread)  # parameters: masses and first moments
+    every = enumerate(readings(fewer, bool(few.share.max() > _GROSS)))
+    gains = [(misfit(fewer.share) - misfit(r.of(fewer).share), i, r) for i, r in every]
+    tried = sorted((x for x in gains if x[0] > _ALIKE), key=lambda x: -x[0])[:_TRIED]
     refined = [(reading.refined(few, 8), i) for _, i, reading in tried]
     left = {r: (misfit(r.of(samples).share), len(r.joints), i) for r, i in refined}
-    least = min(left.values(), default=(0.0,))[0] + _ALIKE
-    alike = [r for r in sorted(left, key=lambda r: left[r][1:]) if left[r][0] < least]
-    if not alike:
+    if not left:
         return None
+    starts = {(r.code, r.joints): r for r in sorted(left, key=lambda r: left[r], reverse=True)}
+    close = [r for r in starts.values() if left[r][0] < min(left.values())[0] + _ALIKE]
+    alike = sorted(close, key=lambda r: left[r][1:])  # the simplest first
     best = alike[0].refined(few, 20)
     read = best.of(samples)
     gain = misfit(samples.held_out) - misfit(read.held_out)

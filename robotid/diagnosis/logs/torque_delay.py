@@ -118,7 +118,7 @@ def check_torque_delay(
         return
     # friction, and a torque that is held between rows, look like a delay of a tenth of these
     error = float(np.hypot(error, DIFFERS * max(_NEAR, step)))
-    least = LEAST_SHARE if abs(delay) > LARGEST_LAG else 0.0
+    least = LEAST_SHARE if abs(delay) > 2 * LARGEST_LAG else 0.0  # other errors look like one
     todo = "none"
     if abs(delay) > BEYOND_NOISE * error and gain > least:
         todo = "of_load" if gain < misfit.by_load else "clear" if gain > LEAST_SHARE else "filter"
