@@ -49,17 +49,18 @@ def parameter_table(
     bodies: Iterable[Mapping[str, Any]], drives: Iterable[Mapping[str, Any]]
 ) -> Any:  # noqa: ANN401
     """Return the parameters of a result as a table, links first, then drives."""
-    import pandas
-
     entries = [*bodies, *({**entry, "prior": None} for entry in drives)]
     rows = []
     for entry in entries:
-        part, _, parameter = entry["name"].rpartition(".")
         low, high = entry.get("interval_95", (None, None))  # of results without intervals
         values = [entry.get("prior"), entry["value"], entry.get("std_error"), low, high]
+        part, _, parameter = entry["name"].rpartition(".")
         rows.append((part, parameter, *values, entry.get("source", ""), entry["unit"]))
-    frame = pandas.DataFrame(rows, columns=list(HEADERS))
-    return frame.astype(dict.fromkeys(_NUMBERS, float))
+    try:
+        import pandas
+    except ImportError:
+        return [dict(zip(HEADERS, row, strict=True)) for row in rows]
+    return pandas.DataFrame(rows, columns=list(HEADERS)).astype(dict.fromkeys(_NUMBERS, float))
 
 
 def _correlations(C: Array, own: Sequence[int]) -> Array:

@@ -1,6 +1,7 @@
 """Which findings a result has."""
 
 import json
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -163,6 +164,14 @@ def test_a_data_frame_has_a_row_for_each_parameter(identified, written, of):
     known = np.isfinite(errors)
     np.testing.assert_array_equal(frame["low"], np.where(known, low, np.nan))
     np.testing.assert_array_equal(frame["high"], np.where(known, high, np.nan))
+
+
+def test_without_pandas_a_table_is_a_list_of_rows(identified, monkeypatch):
+    frame = identified.table()
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    rows = identified.table()
+    assert [row["value"] for row in rows] == list(frame["value"])
+    assert list(rows[0]) == list(frame.columns)
 
 
 def test_the_interval_of_a_parameter_that_is_a_base_parameter_is_that_of_it(identified):
