@@ -213,7 +213,8 @@ def _verdict(
     new = {e.recording.name: e.metrics["estimate"] for e in compress(evaluations, is_new)}
     return judge(
         Predictions(
-            Metrics({}, 0.0), new, tuple(x for x in model.joints if x not in model.passive),
+            Metrics.from_dict(result["identification"]), new,
+            tuple(x for x in model.joints if x not in model.passive),
             refitted=[e.recording.name for e in compress(evaluations, np.logical_not(is_new))],
             hidden=hidden_joints(model, evaluations),
         ),

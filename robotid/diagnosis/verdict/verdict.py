@@ -123,8 +123,6 @@ class Predictions:
         names = [joint for joint in self.on_each() if joint not in validated]
         still = [joint for joint in names if joint not in fitted]
         missing = [joint for joint in names if joint in fitted]
-        if still and not fitted:  # evaluated again without the fitted recordings
-            still, missing = [], still
         named = {"recording": still, "validation log": missing if self.validation else []}
         return [
             sentence_of("verdict:rest", joints=listed(names), logs=logs)

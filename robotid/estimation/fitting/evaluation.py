@@ -57,6 +57,16 @@ class Metrics:
     per_joint: Mapping[str, JointMetrics]  # by name of the joint; joints without rows are not in it
     pooled_rmse: float  # root mean square of the residuals of all joints together [N m, N]
 
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> "Metrics":
+        """Return metrics that were written to result.json."""
+        per_joint, end = {}, "_relative_error_pct"
+        for joint, values in content["per_joint"].items():
+            own = {key: value for key, value in values.items() if not key.endswith(end)}
+            baselines = {key.removesuffix(end): values[key] for key in values.keys() - own.keys()}
+            per_joint[joint] = JointMetrics(**own, baselines=baselines)
+        return cls(per_joint, content["pooled_rmse"])
+
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as they are written to result.json."""
         per_joint = {joint: m.to_dict() for joint, m in self.per_joint.items()}
