@@ -136,7 +136,7 @@ def _over_time(model: RobotModel, content: Mapping[str, Any], course: Course) ->
             units = [_UNITS[k]] * (not all(prismatic)) + [_PRISMATIC[k]] * any(prismatic)
             name, lines = f"{kind} [{' or '.join(units)}]", _lines(model, course.values[k], free)
             chart = Chart(f"{kind} of each joint", course.t, tuple(lines), "time [s]", name, "time")
-            charts.append(chart_html(chart, f"{kind.capitalize()} without a stated limit"))
+            charts.append(chart_html(chart, f"{kind.capitalize()} without a limit"))
     return f'<div class="plots">\n{"".join(charts)}</div>\n'
 
 
