@@ -37,8 +37,7 @@ class RankDeficientError(RobotIdError):
         super().__init__(
             f"the data excite {rank} of {total} base parameters; undetermined: "
             f"{', '.join(self.undetermined)}{f' ({words})' if words else ''}. Record a motion with "
-            "more excitation, or use the estimator 'consistent', which uses the URDF's value for "
-            "undetermined parameters"
+            "more excitation, or use the estimator 'consistent', which keeps the URDF's values"
         )
 
 

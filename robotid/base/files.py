@@ -48,7 +48,7 @@ def check_path(path: str | Path) -> None:
     if len(name) > _LONGEST:
         raise SettingsError(
             f"the name '{os.fsdecode(name)[:_SHOWN]}...' of a file has {len(name)} bytes, expected "
-            f"at most {_LONGEST}; shorten it (names of results start with that of the URDF)"
+            f"at most {_LONGEST}; shorten it (names of results start with the URDF's name)"
         )
 
 

@@ -3,6 +3,7 @@
 import difflib
 import json
 import re
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from string import Formatter
@@ -98,23 +99,15 @@ def grouped(findings: Iterable[Finding], joints: Sequence[str] = ()) -> tuple[Ca
     return tuple(causes)
 
 
-def number_of(causes: Iterable[Cause]) -> int:
-    """Return the number of findings; those with one common message count once."""
-    return sum(len(cause.messages) for cause in causes)
-
-
 def tally(causes: Sequence[Cause], notes: Sequence[Cause], worst: str = "", how: str = "") -> str:
-    """Return the number of findings and causes, the worst joint, and the number of notes."""
-    words = []
-    if causes:
-        words = [f"{_counted(number_of(causes), 'finding')}, {_counted(len(causes), 'cause')}"]
-        words += [f"worst: {worst}"] if worst else []
-    count = number_of(notes)
-    return "; ".join([*words, *([_counted(count, "note") + how] if count else [])])
+    """Return the number of errors, warnings and notes, and the worst joint.
 
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
+    Findings with one common message count once.
+    """
+    counts = Counter(cause.severity for cause in (*causes, *notes) for _ in cause.messages)
+    words = ", ".join(f"{n} {kind}{'s' * (n != 1)}" for kind, n in counts.items())
+    words += how if notes else ""
+    return f"{words}; worst: {worst}" if worst and causes else words
 
 
 def sentence(findings: Sequence[Finding]) -> str:

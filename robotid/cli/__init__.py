@@ -213,6 +213,6 @@ class _StoreOnce(argparse._StoreAction):
         stored = getattr(namespace, self.dest, None)
         if self.option_strings and stored is not None and stored is not self.default:
             raise argparse.ArgumentError(
-                self, f"stated twice, as {stored} and as {values}; state it once"
+                self, f"given twice, as {stored} and as {values}; give it once"
             )
         super().__call__(parser, namespace, values, option_string)

@@ -8,12 +8,10 @@ from typing import Any
 
 from robotid.base.findings import listed
 from robotid.base.text import columns, in_digits_of
-from robotid.cli.console import echo, show_found, window_name
+from robotid.cli.console import SHOWN, echo, show_found, window_name
 from robotid.cli.job import add_shown
 from robotid.identification.summary import cell
 from robotid.output.report.comparison import compare_results, write_comparison
-
-_SHOWN = 12  # base parameters in the table, so that two results fit a screen
 
 
 def compare(results: Sequence[str | Path], page: str | Path | None = None) -> dict[str, Any]:
@@ -64,7 +62,7 @@ def _show(content: dict[str, Any], *, is_verbose: bool) -> None:
         rows = [[e["joint"], *map(cell, e["relative_error_pct"])] for e in per_joint]
         echo(f"\n{title}", "  ")
         print("\n".join(columns(["joint", *labels], rows)))
-    _print_base_parameters(content, labels, None if is_verbose else _SHOWN)
+    _print_base_parameters(content, labels, None if is_verbose else SHOWN)
     for key in ("settings", "versions"):
         for row in content[key]:
             echo(f"{key}: {row['name']}: {' | '.join(v or '-' for v in row['values'])}", "  ")

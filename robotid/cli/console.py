@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from robotid.base.typing import ProgressCallback
     from robotid.output.report.next_steps import Step
 
+SHOWN = 12  # base parameters in a table without --verbose, so that the output fits a screen
 _LAST_STREAM = 2  # the number of the standard error stream
 _ENDS = tuple(getattr(signal, n) for n in ("SIGTERM", "SIGHUP") if hasattr(signal, n))
 
@@ -31,7 +32,7 @@ def echo(text: str, indent: str = "", tone: str = "") -> None:
 
 
 def print_files(names: Sequence[str], folder: str = "") -> None:
-    print("\nwritten:", *(f"  {Path(folder) / name}" for name in names), sep="\n")
+    print(f"\nwritten{folder and f' to {folder}'}: {', '.join(names)}")
 
 
 def print_steps(steps: "Sequence[Step]") -> None:
@@ -64,7 +65,7 @@ def print_causes(
             if message not in printed:
                 echo(f"{cause.severity}: {cause.code}: {message}", "  ", cause.severity)
     hidden = grouped([f for f in findings if f not in shown], joints)
-    if summary := tally(causes, hidden, worst, " hidden (--verbose)") or none:
+    if summary := tally(causes, hidden, worst, " (--verbose)") or none:
         echo(summary)
 
 

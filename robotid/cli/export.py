@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -76,7 +77,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         if not first.among:
             about = {"type": first.kind, "metavar": first.metavar}
         add(f"--{name.replace('_', '-')}", help=_by_format(words), **about)
-    add_shown(parser, "json")
+    words = "print the projection of each friction term and what the format lacks"
+    add_shown(parser, "json", verbose=words)
 
 
 def _by_format(words: Mapping[str, str]) -> str:
@@ -85,10 +87,14 @@ def _by_format(words: Mapping[str, str]) -> str:
 
 def run(options: argparse.Namespace) -> None:
     chosen = {name: getattr(options, name) for name in options_of(formats())}
-    show_found(export(options.result, options.format, options.out, **chosen), options, _show)
+    content = export(options.result, options.format, options.out, **chosen)
+    show_found(content, options, partial(_show, is_verbose=options.verbose))
 
 
-def _show(content: dict[str, Any]) -> None:
+def _show(content: dict[str, Any], *, is_verbose: bool) -> None:
     print(f"written: {', '.join(content['files'])}")
-    for note in content["not_stated"]:
+    notes = content["not_stated"]
+    for note in notes if is_verbose else ():
         echo(f"  {note}", "  ")
+    if notes and not is_verbose:
+        print(f"{len(notes)} note{'s' * (len(notes) > 1)} on this format (--verbose)")

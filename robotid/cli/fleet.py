@@ -171,7 +171,7 @@ def _unit(
             if text != wanted:
                 raise row.error(
                     column,
-                    f"{text!r}, but row {first.number} of the unit {name!r} has {wanted!r}; state "
+                    f"{text!r}, but row {first.number} of the unit {name!r} has {wanted!r}; set "
                     "the same for all logs of a unit, or other names of units",
                 )
         log = row.cells["log"]
@@ -183,7 +183,7 @@ def _unit(
         for column, path in (("urdf", urdf), ("job", job))
     ]
     if not any(files):
-        words = f"the unit {name!r} has no URDF; fill it in, or state one for all units with --urdf"
+        words = f"the unit {name!r} has no URDF; fill it in, or give one for all units with --urdf"
         raise first.error("urdf", words)
     logs = tuple((row.path("log"), row.payload) for row in rows)
     return FleetUnit(name, logs, *files)
@@ -316,7 +316,8 @@ class _Gathered:
                 self._values[key].append((row["unit"], row["value"], row["std_error"]))
         judged = next((row for row in rows if row.get("verdict")), {})
         verdict, texts = judged.get("verdict", "failed"), [row.get("error") for row in rows]
-        reason = "; ".join(filter(None, [*texts, judged.get("reasons")]))
+        first = judged.get("reasons", "").partition("; ")[0]  # the report has all
+        reason = "; ".join(filter(None, [*texts, first]))
         unit = {"unit": rows[0]["unit"], "verdict": verdict, "reason": reason, "report": report}
         self._units.append(unit)
         self._verdicts.update([verdict] * bool(judged))

@@ -12,7 +12,7 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import check_folder, folder_beside, remove_written, write_json
 from robotid.base.findings import Finding
 from robotid.base.settings import require_flag, require_kind
-from robotid.base.text import columns, terminal_width, wrapped
+from robotid.base.text import columns, in_digits_of, terminal_width, wrapped
 from robotid.base.typing import STAGES, ProgressCallback, ignore_progress, report_stage
 from robotid.cli.console import (
     echo,
@@ -131,8 +131,8 @@ def identify(
         job = job_file(model)
         if not (validation is _NO_LOGS and signals is None and controller is None and not ignore):
             raise SettingsError(
-                f"{job.urdf.name} is identified by a job file, which states logs and settings; "
-                "state validation, signals, controller and ignore there"
+                f"{job.urdf.name} is identified by a job file, which has logs and settings; "
+                "set validation, signals, controller and ignore there"
             )
         return identify_job(job, job.model(), WorkPlan(job.workers or 1, progress=progress))
     kinds = (str, EstimatorSettings)
@@ -154,8 +154,8 @@ def identify(
     wanted = wanted_families(friction, model.joints).values()
     if is_simulated and (any(wanted) or len({names is None for names in wanted}) > 1):
         raise SettingsError(
-            "friction is stated by joint or with families, but simulation selects the terms of all "
-            "joints, or of none; expected 'auto' or 'viscous+coulomb'. State terms in the model"
+            "friction is given by joint or with families; for simulation expected 'auto' or "
+            "'viscous+coulomb'. Set terms in the model"
         )
     needs = needed_of(loop) if is_simulated else "torque"
     fitted, held_out = (logs_of(model, some, needs) for some in (logs, validation))
@@ -380,7 +380,7 @@ EXAMPLES = (
 def add_flags(parser: argparse.ArgumentParser) -> None:
     add_job(parser, OUTPUT)
     add_out(parser, "robotid-out")
-    flags = parser.add_argument_group("long logs; these flags do not change a bit of the result")
+    flags = parser.add_argument_group("long logs; performance only")
     add_work(flags, "as in the job file, or one per core for long logs")
     add_shown(parser, "verbose", "progress", json="print result.json")
 
@@ -407,12 +407,14 @@ def show_result(
     echo(f"\n{result['robot']}: {len(result['joints'])} joints, {_structure_words(result)}")
     roles = ("identification", "validation")
     fitted, validation = (recordings_of(result["inputs"], role) for role in roles)
-    echo(f"\nfitted: {', '.join(fitted)}", "  ")
-    print("\n".join(error_lines(result["identification"], wls and wls["identification"], width)))
+    if is_verbose or not validation:
+        echo(f"\nfitted: {', '.join(fitted)}", "  ")
+        errors = error_lines(result["identification"], wls and wls["identification"], width)
+        print("\n".join(errors))
     for k, (name, ours) in enumerate(zip(validation, result["validation"], strict=True)):
         echo(f"\nnot fitted: {name}", "  ")
         print("\n".join(error_lines(ours, wls and wls["validation"][k], width)))
-    if lines := _drive_lines(result):
+    if lines := _drive_lines(result, is_verbose=is_verbose):
         print("\n" + "\n".join(wrapped(line, width, "  ") for line in lines))
     print()
     print_causes(
@@ -434,24 +436,32 @@ def _structure_words(result: Mapping[str, Any]) -> str:
     structure, (before, after, _) = result["structure"], result["scale_check"]["masses"]
     assumed = " assumed" if result["scale_check"].get("assumed") else ""
     return (
-        f"{structure['base']} base parameters ({structure['base_inertial']} inertial), condition "
-        f"number {structure['condition']:.3g} (regressor, unit columns), "
+        f"{structure['base']} base parameters, condition number {structure['condition']:.3g}, "
         f"total mass {before:.2f}{assumed} -> {after:.2f} kg"
     )
 
 
-def _drive_lines(result: Mapping[str, Any]) -> list[str]:
-    """Return the friction terms, or all parameters of drives and controllers of a simulation."""
+def _drive_lines(result: Mapping[str, Any], *, is_verbose: bool) -> list[str]:
+    """Return the friction terms, or the parameters of drives and controllers of a simulation."""
     varied = variation_lines(result.get("variation"))
     if "simulation" not in result:
         left_out = left_out_lines(result.get("left_out", ()))
         return [*friction_lines(result["friction"]), *left_out, *varied]
-    rows = []
-    for entry in result["drive_parameters"]:
-        if (error := entry["std_error"]) is not None:
-            half = "at bound" if entry["source"] == "bound" else f"{error:.2g}"
+    fitted = [entry for entry in result["drive_parameters"] if entry["std_error"] is not None]
+    if is_verbose:
+        rows = []
+        for entry in fitted:
+            half = "at bound" if entry["source"] == "bound" else f"{entry['std_error']:.2g}"
             rows.append((entry["name"], f"{entry['value']:.4g}", half, entry["unit"]))
-    return columns(("parameter", "value", "+-", "unit"), rows) + varied
+        return columns(("parameter", "value", "+-", "unit"), rows) + varied
+    drives: dict[str, dict[str, str]] = {}
+    for entry in fitted:
+        owner, _, term = entry["name"].rpartition(".")
+        value, _ = in_digits_of(entry["value"], entry["std_error"])
+        drives.setdefault(owner, {})[f"{term}\n{entry['unit']}"] = value
+    heads = dict.fromkeys(head for values in drives.values() for head in values)
+    rows = [[drive, *(values.get(head, "-") for head in heads)] for drive, values in drives.items()]
+    return columns(["drive\n", *heads], rows, width=terminal_width(), needed=2) + varied
 
 
 def _worst(result: Mapping[str, Any]) -> str:

@@ -128,7 +128,7 @@ class PayloadEntry(Settings):
         MISSING, "known mass of the payload [kg]",
         within=Range("more than 0 and less than 1e6", lambda x: 0 < x < 1e6),
     )  # fmt: skip
-    link: str = setting("", "link that carries it; the last moving link if not stated")
+    link: str = setting("", "link that carries it; default: the last moving link")
     start: float | None = setting(None, "start of the window in the log's own time [s]")
     end: float | None = setting(None, "end of the window [s]")
 
@@ -139,7 +139,7 @@ class Job(Settings):
 
     urdf: Path = setting(MISSING, "the URDF file", **_FILE)
     joints: tuple[str, ...] | None = setting(
-        None, "joints to identify, in order; all movable joints if not stated"
+        None, "joints to identify, in order; default: all movable joints"
     )
     locked: Mapping[str, float] = setting(
         {}, 'positions of locked joints, "*" for all other joints [rad or m]'
@@ -230,7 +230,7 @@ class Job(Settings):
         at="reduction.rows_in_memory", within=POSITIVE,
     )  # fmt: skip
     workers: int | None = setting(
-        None, "worker processes for the pieces; one per core for long logs if not stated",
+        None, "worker processes for the pieces; default: one per core for long logs",
         at="reduction.workers", within=Range("1 to 1024", lambda x: 1 <= x <= 1024),
     )  # fmt: skip
 
@@ -251,7 +251,7 @@ class Job(Settings):
         is_looped = isinstance(self.estimator, SimulationSettings)
         if self.controller != LoopSettings() and not is_looped:
             raise SettingsError(
-                f"[controller] is stated, but the estimator is {self.estimator.name!r}, expected "
+                f"[controller] is given, but the estimator is {self.estimator.name!r}, expected "
                 "'simulation'; set [estimator] name = 'simulation', or remove [controller]"
             )
 
@@ -408,7 +408,7 @@ def _once(words: Sequence[str], flag: str) -> dict[str, str]:
         name, _, value = word.partition("=")
         if texts.setdefault(name, value) != value:
             raise SettingsError(
-                f"{flag} states {name} twice, as {texts[name]} and as {value}; state it once"
+                f"{flag} has {name} twice, as {texts[name]} and as {value}; give it once"
             )
     return texts
 
@@ -601,8 +601,8 @@ def job_from_flags(options: argparse.Namespace) -> Job:
     if Path(options.source).suffix == ".toml":
         if given := [*logs, *_given(options)]:
             raise SettingsError(
-                f"{options.source} is a job file; it states the logs and settings. Remove "
-                f"{listed(given)}, and state them in the job file"
+                f"{options.source} is a job file; it has the logs and settings. Remove "
+                f"{listed(given)}, and set them in the job file"
             )
         return read_job(options.source)
     if logs == []:

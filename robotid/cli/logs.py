@@ -83,7 +83,7 @@ def units_of_logs(entries: Sequence[LogEntry]) -> list[str]:
         named = next(entry for entry in entries if entry.unit)
         raise SettingsError(
             f"{unnamed[0].path.name} has no unit, but {named.path.name} has unit = "
-            f"{named.unit!r}; state the unit (name of the robot) of each log, or of none"
+            f"{named.unit!r}; give the unit (name of the robot) of each log, or of none"
         )
     return [entry.unit or "" for entry in entries]
 
@@ -94,7 +94,7 @@ def examine(
     """Examine the logs of a job; the findings have errors first."""
     check_ignored(job.ignore)
     if not (job.identification or job.validation):
-        raise SettingsError("the job has no log; state one: [[identification]] with log = FILE")
+        raise SettingsError("the job has no log; add one: [[identification]] with log = FILE")
     model = model or job.model()
     refused: list[Finding] = []
 
@@ -122,7 +122,7 @@ def locked_as_logged(
         return job, model, fitted, validation, ()
     shown = ", ".join(f"{joint} = {position:.4g}" for joint, position in logged.items())
     message = (
-        f"joints are locked at their positions in the logs: {shown}. State other positions with "
+        f"joints are locked at their positions in the logs: {shown}. Set other positions with "
         "locked = { joint = position }"
     )
     message += "".join(percent_hint(model, *place, job.units) for place in logged.items())

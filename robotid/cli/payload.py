@@ -126,7 +126,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     if any(map(is_result, options.reference)):
-        refuse_log_flags(options, "a RESULT states how its logs are read")
+        refuse_log_flags(options, "a RESULT has the settings of its logs")
     with progress_of(options) as progress:
         content = measure_payload(
             job_from_flags(options), options.reference, links=options.link, masses=options.mass,
@@ -142,7 +142,7 @@ def _show(content: dict[str, Any]) -> None:
     errors = [f"{joint} {cell(x)} %" for joint, x in content["relative_error_pct"].items()]
     echo(f"torque prediction error: {listed(errors)}", "  ")
     if "gains" in content:
-        checked = "the gains are those with which this payload has the stated mass"
+        checked = "the gains are those with which this payload has the given mass"
         echo(f"{checked}; verify them with another payload or another log of it", "  ")
         print("\n[torque.gains]")
         for joint, gain in content["gains"].items():
@@ -156,7 +156,7 @@ def _print_one_payload(load: Mapping[str, Any], check: Mapping[str, Any] | None)
     mass, error = in_digits_of(load["mass"], load["mass_std_error"])
     print(f"payload on {link}")
     if error == "-":
-        print(f"  mass {load['mass']:g} kg, stated")
+        print(f"  mass {load['mass']:g} kg, given")
         if check is not None:
             echo(f"  scale of the torques: {check['message']}", "  ")
     else:

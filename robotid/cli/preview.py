@@ -1,6 +1,7 @@
 """robotid preview: compute the expected standard errors of a motion before it is recorded."""
 
 import argparse
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -13,7 +14,7 @@ from robotid.base.exceptions import DataError
 from robotid.base.files import file_sha256
 from robotid.base.findings import listed
 from robotid.base.text import columns
-from robotid.cli.console import echo, recordings_of, show_found
+from robotid.cli.console import SHOWN, echo, recordings_of, show_found
 from robotid.cli.job import (
     JOB,
     MOTION,
@@ -113,7 +114,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     if options.given:
-        refuse_log_flags(options, "a RESULT states how its logs are read")
+        refuse_log_flags(options, "a RESULT has the settings of its logs")
     job, noise = job_from_flags(options), pairs(options.noise, "--noise")
     content = preview_job(job, options.given, noise=noise, correlation=options.correlation)
     show_found(content, options, partial(_show, is_verbose=options.verbose))
@@ -123,12 +124,19 @@ def _show(content: dict[str, Any], *, is_verbose: bool) -> None:
     motions = recordings_of(content["motions"], "motion")
     count = f"{content['structure']['base']} base parameters, by {content['estimator']}"
     echo(f"{content['robot']}: {', '.join(motions)}; {count}", "  ")
-    echo("\nbase parameters: expected standard errors, and their share of the plausible spread")
+    entries, shown = content["base_parameters"], content["base_parameters"]
+    if not is_verbose:
+        largest = sorted(entries, key=lambda e: -(e["std_error"] or math.inf) / e["plausible"])
+        shown = [entry for entry in entries if entry in largest[:SHOWN]]
+    echo(
+        f"\nthe {len(shown)} least determined base parameters: expected standard errors, and their "
+        "share of the plausible spread"
+    )
     heads = {"std_error_before": "before", "gain": "gain", "achieved_std_error": "achieved",
              "ratio": "ratio"}  # fmt: skip
-    keys = {key: head for key, head in heads.items() if key in content["base_parameters"][0]}
+    keys = {key: head for key, head in heads.items() if key in entries[0]}
     rows = []
-    for entry in content["base_parameters"]:
+    for entry in shown:
         error, more = entry["std_error"], len(_TERM.findall(entry["expression"]))
         short = f"{entry['name']} + {more} more" if more else entry["name"]
         left = "open" if error is None else f"{100 * min(error / entry['plausible'], 1):.0f} %"
@@ -145,7 +153,7 @@ def _show(content: dict[str, Any], *, is_verbose: bool) -> None:
                  e["source"]] for e in parameters]  # fmt: skip
         print("\n".join(columns(["", "prior", "+-", "", "by"], rows, left=(0, 3, 4))))
     else:
-        echo("each standard parameter, and the terms of each base parameter: --verbose")
+        echo("all parameters, and the terms of each base parameter: --verbose")
     _print_expected_torque(content)
     echo(f"\n{content['words']}", "  ")
     if achieved := content.get("achieved"):
@@ -159,8 +167,8 @@ def _show(content: dict[str, Any], *, is_verbose: bool) -> None:
 def _print_expected_torque(content: Mapping[str, Any]) -> None:
     """Print each joint's torque with its band, and the assumed or stated noise."""
     echo(
-        "\nRMS torque of the motion, half width of the 95 % prediction band, and the part of it "
-        "that the uncertainty of the parameters causes"
+        "\nRMS torque of the motion, half width of the 95 % prediction band, and its part from the "
+        "parameters"
     )
     rows, noises = [], content["noise"].values()
     further = ["achieved"] if all("achieved" in noise for noise in noises) else []
@@ -173,9 +181,9 @@ def _print_expected_torque(content: Mapping[str, Any]) -> None:
     print("\n".join(columns(heads, rows, left=(0, len(heads) - 3, len(heads) - 1))))
     if any(noise["is"] == "assumed" for noise in noises):
         echo(
-            "assumed noise: 1 % of the URDF's effort limit, or of the largest torque of the bodies "
-            "where there is no limit. Standard errors are proportional to the noise. State it with "
-            "--noise JOINT=N_M, or use that of an earlier run with --given RESULT",
+            "assumed noise: 1 % of the URDF's effort limit, or of the largest torque without a "
+            "limit. Standard errors are proportional to it. Give it with --noise JOINT=N_M, or use "
+            "the noise of an earlier run with --given RESULT",
             "  ",
         )
 

@@ -315,7 +315,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     findings = read_findings(options.results)
     if options.results:
-        refuse_log_flags(options, "a RESULT states how its logs are read")
+        refuse_log_flags(options, "a RESULT has the settings of its logs")
         job = findings.job(options.source, options.logs[0])
     else:
         job = job_from_flags(options)

@@ -206,9 +206,9 @@ def simulation_from_flags(options: argparse.Namespace) -> tuple[Job, Simulation]
             )
     if Path(options.source).suffix == ".toml":
         if drives:
-            raise SettingsError(f"{options.plant} has drives; state them in {options.source}")
+            raise SettingsError(f"{options.plant} has drives; set them in {options.source}")
         if given := [flag for flag in JOB.given(options) if flag in ROBOT]:
-            raise SettingsError(f"{options.source} is a job file; state {listed(given)} in it")
+            raise SettingsError(f"{options.source} is a job file; set {listed(given)} in it")
         return read_job(options.source), settings
     if options.plant:  # errors of its drives then name this file
         job_from_settings({"urdf": options.source, "drives": drives}, options.plant, Path())
@@ -224,9 +224,8 @@ def _show(content: dict[str, Any]) -> None:
     noise = content["settings"].get("sensors", {}).get("noise", {})
     if not any(noise.get(kind) for kind in ("tau", "torque")):
         echo(
-            "the torques have no noise: errors of parameters from this log are smaller than those "
-            "from a recorded log, and than those of a preview, which assumes noise. Add noise with "
-            "--torque-noise 0.02, a share of the torque"
+            "the torques have no noise: a recorded log gives larger errors of parameters. Add "
+            "noise with --torque-noise 0.02, a share of the torque"
         )
     width = max(map(len, ("position error", *content["joints"])))
     print(f"\n{'position error':{width}}  rms, largest")
@@ -239,6 +238,6 @@ def _show(content: dict[str, Any]) -> None:
             moves = f"moves {joint['range']:.2g} {unit}, expected {joint['commanded']:.2g} {unit}"
             values = f'[truth] values = {{ "{name}.coulomb" = 0 }}'
             echo(
-                f"  warning: {name} {moves}. If its friction stops it, state it in the "
+                f"  warning: {name} {moves}. If its friction stops it, set it in the "
                 f"file of --plant: {values}, or larger gains under [controller]", "  ", "warning",
             )  # fmt: skip

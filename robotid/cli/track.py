@@ -1,6 +1,7 @@
 """robotid track: run the online estimator over a log: history, step changes."""
 
 import argparse
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from robotid.base.exceptions import SettingsError
 from robotid.base.files import check_folder, file_sha256, folder_beside, write_json
 from robotid.base.text import columns, in_digits_of
 from robotid.base.versions import __version__
-from robotid.cli.console import echo, show_found
+from robotid.cli.console import SHOWN, echo, show_found
 from robotid.cli.job import JOB, ONLINE, Job, add_out, add_shown, job_from_flags
 from robotid.data.files.read import write_columns
 from robotid.data.log import Log
@@ -27,7 +28,7 @@ def run_track(job: Job, folder: str | Path) -> dict[str, Any]:
     log = job.read(entry, model)
     if job.signals.cutoff is None:
         words = "the cutoff is disabled, but the online estimator differentiates positions"
-        raise SettingsError(f"{words}; state a cutoff in Hz")
+        raise SettingsError(f"{words}; set a cutoff in Hz")
     rate = job.signals.rate or 1.0 / float(np.median(np.diff(log.t)))
     cutoff, slowest = job.signals.cutoff, job.signals.min_velocity
     settings = OnlineSettings(rate=rate, cutoff=cutoff, min_velocity=slowest)
@@ -81,10 +82,11 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     content = run_track(job_from_flags(options), options.out)
-    show_found(content, options, _show, [content["history"], "track.json"], options.out)
+    show = partial(_show, is_verbose=options.verbose)
+    show_found(content, options, show, [content["history"], "track.json"], options.out)
 
 
-def _show(content: dict[str, Any]) -> None:
+def _show(content: dict[str, Any], *, is_verbose: bool) -> None:
     converged = content["converged_at"]
     when = "not converged" if converged is None else f"converged at {converged:.2f} s"
     echo(
@@ -97,8 +99,12 @@ def _show(content: dict[str, Any]) -> None:
         when = f"at {change['onset']:.2f} s, detected at {change['flagged']:.2f} s"
         payload = f"equivalent payload on {load['body']}: {mass} +- {error} kg"
         echo(f"step change {when}; {payload}", "  ")
-    rows = []
-    for entry in content["base_parameters"]:
+    rows, entries = [], content["base_parameters"]
+    if not is_verbose:
+        ranked = sorted(entries, key=lambda entry: entry["std_error"] / (abs(entry["value"]) or 1))
+        entries = [entry for entry in entries if entry in ranked[:SHOWN]]
+        echo(f"the {len(entries)} most certain base parameters (all: --verbose)")
+    for entry in entries:
         value, error = in_digits_of(entry["value"], entry["std_error"])
         rows.append([entry["name"], value, f"+- {error}", entry["unit"]])
     print("\n".join(columns(["", "", "", ""], rows, left=(0, 2, 3))[1:]))

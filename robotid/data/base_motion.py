@@ -28,11 +28,11 @@ LEVEL = 2.0  # [s] in which the mean specific force is vertical
 _BREAK = 0.1  # [s] a longer time step: the angular velocity in it is not known
 _POSE_REMEDY = (
     "Record base_x, base_y, base_z [m] and the orientation base_qx, base_qy, base_qz, base_qw, or "
-    "base_roll, base_pitch, base_yaw [rad]; or state the link of an IMU, imu in [base]"
+    "base_roll, base_pitch, base_yaw [rad]; or set the link of an IMU, imu in [base]"
 )
 _IMU_REMEDY = (
     "Record imu_wx, imu_wy, imu_wz [rad/s], imu_ax, imu_ay, imu_az [m/s^2], and the orientation "
-    "imu_qx, imu_qy, imu_qz, imu_qw, or that of the base"
+    "imu_qx, imu_qy, imu_qz, imu_qw, or the base's orientation"
 )
 _UNIT = 1e-3  # tolerance of the norm of a logged quaternion
 _BESIDE, _USUAL = 32, 75.0  # rows beside a step, and the percentile of their steps ...
@@ -263,7 +263,7 @@ def contacts_of(values: Array, wanted: BaseColumns, where: str) -> dict[str, Arr
         if len(wrong):
             raise DataError(
                 f"{where}: contact_{link} is {flags[wrong[0]]:g} in row {wrong[0]}, expected 0 or "
-                "1; if it is a force, state threshold in [[contact]]"
+                "1; if it is a force, set threshold in [[contact]]"
             )
     return {link: flags == 1.0 for link, flags in zip(links, values.T, strict=True)}
 

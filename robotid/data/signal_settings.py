@@ -50,7 +50,7 @@ class SignalSettings(Settings):
 
     rate: float | None = setting(
         None,
-        "rate of the uniform grid [Hz]; if not stated, the log's median rate (without a filter, "
+        "rate of the uniform grid [Hz]; default: the log's median rate (without a filter, "
         "the rows of the log)",
         within=_HZ,
     )
@@ -97,7 +97,7 @@ class SignalSettings(Settings):
     )
     max_gap: float | None = setting(
         None,
-        "a longer time step is a gap [s]; if not stated, 2.5 median steps, or a quarter of the "
+        "a longer time step is a gap [s]; default: 2.5 median steps, or a quarter of the "
         "filter's period if that is longer",
         within=POSITIVE,
     )
@@ -187,8 +187,8 @@ class LogSource(Settings):
     )
     sensors: tuple[str, ...] = setting(
         (),
-        "the topics of a bag with odometry, IMU, wrenches or foot forces; all topics of these "
-        "kinds if not stated",
+        "the topics of a bag with odometry, IMU, wrenches or foot forces; default: all topics of "
+        "these kinds",
         dump=lambda topics: list(topics) or None,
     )
 
@@ -212,13 +212,13 @@ class BaseSource(Settings):
 
     twist: str = setting(
         "base",
-        "axes of the velocities base_vx to base_wz: base, those of the base link, or world",
+        "axes of the velocities base_vx to base_wz: base (axes of the base link) or world",
         among=("base", "world"),
     )
     link: str | None = setting(
         None,
-        "the link whose pose base_x to base_qw are, as the chest of a human; the root link if not "
-        "stated. Velocities of another link are not read",
+        "the link whose pose base_x to base_qw are, as the chest of a human; default: the root "
+        "link. Velocities of another link are not read",
     )
     imu: str | None = setting(
         None,
@@ -254,13 +254,11 @@ class Transmission(Settings):
         dump=_dump_matrix,
     )
     motors: tuple[str, ...] = setting(
-        (), "names of the motors in the columns, one per joint; names of the joints if not stated"
+        (), "names of the motors in the columns, one per joint; default: the joints' names"
     )
-    efficiency: tuple[float, ...] = setting(
-        (), "efficiency of each motor's gear [-], 1 if not stated"
-    )
+    efficiency: tuple[float, ...] = setting((), "efficiency of each motor's gear [-]; default: 1")
     offset: tuple[float, ...] = setting(
-        (), "positions of the joints at motor position 0 [rad or m]; 0 if not stated"
+        (), "positions of the joints at motor position 0 [rad or m]; default: 0"
     )
 
     def __post_init__(self) -> None:
@@ -342,7 +340,7 @@ class Transmission(Settings):
             raise SettingsError(
                 f"transmission: matrix is 'urdf', but the URDF has no <transmission> with a "
                 f"<mechanicalReduction> only for {listed(missing)}; it has one for "
-                f"{listed(reductions) or 'no joint'}. State the gear ratios: matrix = [...]"
+                f"{listed(reductions) or 'no joint'}. Set the gear ratios: matrix = [...]"
             )
         return replace(self, matrix=tuple(reductions[joint] for joint in self.joints))
 
@@ -361,10 +359,9 @@ class Transmission(Settings):
         sizes = np.linalg.svd(self.T / np.where(size > 0, size, 1.0), compute_uv=False)
         if not sizes[-1] > SINGULAR * sizes[0]:
             raise SettingsError(
-                f"transmission of {listed(self.joints)}: matrix {shown} is singular, so the motor "
-                "positions do not determine the joint positions. Each row is a motor, as "
-                "[0, 32, 32] for a motor with a ratio of 32 to each of the last two joints; no row "
-                "may be a linear combination of others"
+                f"transmission of {listed(self.joints)}: matrix {shown} is singular, expected "
+                "linearly independent rows, one for each motor, as [0, 32, 32] for a motor with a "
+                "ratio of 32 to each of the last two joints"
             )
 
 

@@ -252,9 +252,8 @@ def low_pass(values: Array, rate: float, settings: SignalSettings) -> Array:
 def too_short(where: str, segments: int, settings: SignalSettings) -> DataError:
     """Return the error of a log without a segment that is long enough."""
     return DataError(
-        f"{where}: none of its {segments} segments without gaps is long "
-        f"enough for the filter and a trim of {settings.trim:g} s at each end; record longer, "
-        "or lower trim",
+        f"{where}: none of its {segments} segments without gaps is long enough for the filter and "
+        f"a trim of {settings.trim:g} s at each end; record longer, or lower trim",
         code="too_short",
     )
 

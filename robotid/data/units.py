@@ -68,8 +68,7 @@ def _check_step(step: float, start: float, where: str) -> None:
     raise DataError(
         f"{where}: median step {step:.6g} looks like {_TIME_NAMES[unit]}{since} "
         f"({PER_SECOND[unit] / step:.4g} Hz); in seconds it would be {1 / step:.3g} Hz. "
-        f"{_how_to_state('time', unit, 's')}. To convert it, multiply by "
-        f"{1 / PER_SECOND[unit]:g}",
+        f"{_how_to_state('time', unit, 's')}. To convert it, multiply by {1 / PER_SECOND[unit]:g}",
         code="time_unit",
     )
 
@@ -117,8 +116,8 @@ def turned(joints: Sequence[str], q: Array, turning: Collection[str]) -> tuple[s
     if not far:
         return ()
     return (
-        f"more than two revolutions of {listed(far)} are read in radians, since the URDF states no "
-        'range; if the log is in degrees, state units angle = "deg" (--angle-unit deg)',
+        f"more than two revolutions of {listed(far)} are read in radians, since the URDF has no "
+        'range; if the log is in degrees, set units angle = "deg" (--angle-unit deg)',
     )
 
 
@@ -136,7 +135,7 @@ def _alone(log: Log, kind: str, j: int, others: Array) -> str:
     return (
         f"The other revolute joints reach at most {others.max():.3g}: this joint alone may be in "
         f"degrees. Then multiply {columns} by {np.pi / 180:.7f} (pi / 180) in the recording, "
-        "because a stated unit applies to all joints"
+        "because the unit applies to all joints"
     )
 
 
@@ -152,9 +151,9 @@ def _check_commands(log: Log, is_revolute: Array) -> None:
     ratio = np.abs(factor)
     for j in np.flatnonzero(_is_near(ratio, np.degrees(1.0)) | _is_near(ratio, np.radians(1.0))):
         raise DataError(
-            f"{log.name}: the motion of qref_{log.joints[j]} is {factor[j]:.3g} times that of "
-            f"q_{log.joints[j]}: one of them looks like degrees, the other like radians. Convert "
-            f"one of them in the recording. {_how_to_state('angle', 'deg', 'rad', both=True)}",
+            f"{log.name}: the motion of qref_{log.joints[j]} is {factor[j]:.3g} times the "
+            f"motion of q_{log.joints[j]}: one looks like degrees, the other like radians. "
+            f"Convert one in the recording. {_how_to_state('angle', 'deg', 'rad', both=True)}",
             code="angle_unit",
         )
 
@@ -166,8 +165,7 @@ def _check_degrees(log: Log, factor: Array) -> None:
             raise DataError(
                 f"{log.name}: dq_{log.joints[j]} is {abs(factor[j]):.3g} times d(q)/dt: the "
                 f"{wrong} looks like degrees, the other like radians. Convert one of them in the "
-                "recording. "
-                f"{_how_to_state('angle', 'deg', 'rad', both=True)}",
+                f"recording. {_how_to_state('angle', 'deg', 'rad', both=True)}",
                 code="angle_unit",
             )
 
@@ -180,8 +178,8 @@ def _how_to_state(kind: str, unit: str, si: str, both: bool = False) -> str:
         f'Python units=LogUnits({kind}="{stated}"))'
     )
     if stated == si:
-        return f"To read the values without conversion, state {ways}"
-    return f'State {ways}, or "{si}" if this is the unit'
+        return f"To read the values without conversion, set {ways}"
+    return f'Set {ways}, or "{si}" if this is the unit'
 
 
 def _velocity_factor(log: Log) -> Array:

@@ -58,7 +58,7 @@ class MotionSettings(Settings):
         0.9, "usable share of the URDF's limits", within=_from(1e-3, 1.0, " of the limits")
     )
     velocity: Mapping[str, float] = setting(
-        {}, "largest velocity of a joint whose URDF states none, or a lower one [rad/s or m/s]"
+        {}, "largest velocity of a joint whose URDF has none, or a lower one [rad/s or m/s]"
     )
     torque: Mapping[str, float] = setting({}, "largest torque of a joint, likewise [N m or N]")
     acceleration: Mapping[str, float] = setting(

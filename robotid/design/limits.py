@@ -57,9 +57,8 @@ class MotionLimits:
             missing += [f"{joint.name} ({' and '.join(lacks)})"] if lacks else []
         if missing:
             raise SettingsError(
-                f"{Path(model.tree.path).name} states no limit of {listed(missing)}: without it no "
-                "safe motion can be designed; add <limit lower upper velocity effort> to these "
-                "joints, state velocities as --max-velocity JOINT=X, or lock the joints"
+                f"{Path(model.tree.path).name} has no limit of {listed(missing)}; add <limit lower "
+                "upper velocity effort>, give --max-velocity JOINT=X, or lock these joints"
             )
         middle = [(j.lower + j.upper) / 2 if j.has_limits else 0.0 for j in model.limits]
         half = [(j.upper - j.lower) / 2 if j.has_limits else _FREE for j in model.limits]
@@ -85,7 +84,7 @@ def _each(model: RobotModel, stated: float | Mapping[str, float], what: str) -> 
     for name, value in by_name.items():
         if name not in model.joints:
             raise SettingsError(
-                f"{what} is stated for {name!r}, which is not a moving joint; moving joints: "
+                f"{what} is given for {name!r}, which is not a moving joint; moving joints: "
                 f"{listed(model.joints)}"
             )
         if not value > 0:
@@ -175,10 +174,9 @@ class Postures:
             return f"{tried}: {alone}"
         most = [f"{words} in {100 * share:.0f} %" for share, _, words in broken]
         return (
-            f"{tried}: each violates a limit or a distance, expected one without violations. Most "
-            f"frequent: {listed(most, 3)}. Narrow the position limits of these joints, lock joints "
-            "that need not move, lower the clearance, or omit the collision check (--clearance "
-            "none)"
+            f"{tried}: each violates a limit or a distance. Most frequent: {listed(most, 3)}. "
+            "Narrow the position limits of these joints, lock joints, lower the clearance, or omit "
+            "the collision check (--clearance none)"
         )
 
     def _broken(self, used: Array, margins: Array) -> list[tuple[float, str, str]]:
@@ -188,7 +186,7 @@ class Postures:
             own = used[kind, :, joint]
             least = (
                 f"{names[joint]} needs at least {_percent(own.min())} % of its {LIMITS[kind]} "
-                "limit; state the robot's actual limits, or its actual payload"
+                "limit; set the robot's actual limits, or its actual payload"
             )
             some = f"{names[joint]} needs more than its {LIMITS[kind]} limit"
             found.append((float(np.mean(own > 1.0)), least, some))

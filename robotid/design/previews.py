@@ -101,7 +101,7 @@ def assumed_noise(
     for joint, value in stated.items():
         if joint not in model.joints:
             raise SettingsError(
-                f"noise is stated for {joint!r}, which is not among the joints "
+                f"noise is given for {joint!r}, which is not among the joints "
                 f"{listed(model.joints)}{suggestion(str(joint), model.joints)}"
             )
         if not (is_number(value) and SIZE.holds(value)):

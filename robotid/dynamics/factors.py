@@ -116,7 +116,7 @@ class Problem:
 def concatenate(problems: Sequence[Problem]) -> Problem:
     """Return one problem with the rows of several in order, for several logs of one robot."""
     if not problems:
-        raise DataError("there is no problem, expected that of at least one log")
+        raise DataError("there is no problem, expected at least one log")
     first = problems[0]
     for other in problems[1:]:
         if other.names != first.names or other.n_joints != first.n_joints:
@@ -304,7 +304,7 @@ def compress_segments(
 def merge(factors: Sequence[Factors]) -> Factors:
     """Return the factors of all rows of several logs."""
     if not factors:
-        raise DataError("there are no factors, expected those of at least one log")
+        raise DataError("there are no factors, expected at least one log")
     first = factors[0]
     for other in factors[1:]:
         if other.names != first.names or len(other.rows) != len(first.rows):

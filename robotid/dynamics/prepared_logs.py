@@ -50,7 +50,7 @@ def closed_log(model: RobotModel, log: Log) -> Log:
     pose = _root_poses(model, log.q, log.base.pose, log.base.link)
     if not log.base.has_position:
         pose[:, :3] = 0.0
-    note = f"the pose of the base is computed from that of {log.base.link}"
+    note = f"the pose of the base is computed from the pose of {log.base.link}"
     base = BaseMotion(pose, imu=log.base.imu)
     return replace(log, base=base, notes=(*log.notes, note))
 
@@ -66,7 +66,7 @@ def _with_passive(model: RobotModel, log: Log) -> Log:
     if absent and not model.loops:
         raise DataError(
             f"{log.name} has no position of {listed(absent)}, and no loop determines it; log it, "
-            "or state [[loop]]"
+            "or add [[loop]]"
         )
     if model.loops:
         q = _closed(model, log, q, missing)
@@ -161,7 +161,7 @@ def find_contacts(
     if forced := [x.frame for x in wanted if x.measured]:
         raise DataError(
             f"{log.name} has no column contact_{forced[0]}, but a measured force there. Name the "
-            "column of the force in [columns], and state threshold in [[contact]]",
+            "column of the force in [columns], and set threshold in [[contact]]",
             code="missing_column",
         )
     stated = {x.frame: x for x in model.contacts if x not in wanted}
@@ -189,10 +189,9 @@ def _up(model: RobotModel) -> Array:
 def _unknown(log: Log, frames: Sequence[str], why: str) -> DataError:
     return DataError(
         f"{log.name} has no column of the contact of {listed(frames)}, and the contact cannot be "
-        f"found from torques and motion: {why}. Record contact_{frames[0]}, 1 while the link "
-        "touches the ground, 0 otherwise; or the force of the foot, with threshold in "
-        "[[contact]]; or the torques of all joints and the pose of the base. If it always touches, "
-        "state always = true",
+        f"found from torques and motion: {why}. Record contact_{frames[0]} (1 in contact, else 0), "
+        "the foot's force with threshold in [[contact]], or all torques and the base's pose; or "
+        "set always = true",
         code="missing_column",
     )
 

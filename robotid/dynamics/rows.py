@@ -444,8 +444,8 @@ def trajectory_rows(
     """Return all rows of a trajectory with all standard parameters: weight (N, n_rows)."""
     if trajectory.joints != model.joints:
         raise DataError(
-            f"the trajectory has the joints {listed(trajectory.joints)}, expected those of the "
-            f"model, {listed(model.joints)}; read the log with joints=model.joints"
+            f"the trajectory has the joints {listed(trajectory.joints)}, expected the model's, "
+            f"{listed(model.joints)}; read the log with joints=model.joints"
         )
     shape = (len(trajectory.t), model.n_rows)
     weights = np.broadcast_to(1.0, shape) if weight is None else weight

@@ -438,9 +438,8 @@ class OnlineIdentifier:
     def _require_ready(self) -> Kalman:
         if self._kalman is None:
             raise DataError(
-                "no estimate yet: the robot has moved for "
-                f"{len(self._warmup) * self._dt:.2f} s, and the warm-up needs "
-                f"{self.settings.warmup:g} s of motion"
+                f"no estimate yet: the robot has moved for {len(self._warmup) * self._dt:.2f} s, "
+                f"and the warm-up needs {self.settings.warmup:g} s of motion"
             )
         return self._kalman
 

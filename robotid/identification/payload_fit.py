@@ -334,8 +334,8 @@ def fit_payloads(
     refuse_loops(model, "the identification of a payload")
     if unknown_gains and (model.free_flyer or model.constraints):  # constraints mix the rows
         raise SettingsError(
-            f"unknown gains are stated for {listed(unknown_gains)}; gains are identified for a "
-            "robot with a fixed base, without contacts and loops. State them"
+            f"unknown gains are given for {listed(unknown_gains)}; gains are identified for a "
+            "robot with a fixed base, without contacts and loops. Set them"
         )
     if not loaded.model.layout.remembering:
         return _fit(loaded, reference, links, masses, unknown_gains)
@@ -433,7 +433,7 @@ def _check_known(
     for link, mass in masses.items():
         if link not in links:
             raise SettingsError(
-                f"a mass is stated for {link}, but the payloads are on {listed(links)}; add the "
+                f"a mass is given for {link}, but the payloads are on {listed(links)}; add the "
                 "link to these"
             )
         if not (is_number(mass) and 0 < mass < 1e6):
@@ -444,12 +444,12 @@ def _check_known(
     unknown = [joint for joint in gains if joint not in model.joints]
     if unknown:
         raise SettingsError(
-            f"unknown gains are stated for {listed(unknown)}, which are not identified joints; "
+            f"unknown gains are given for {listed(unknown)}, which are not identified joints; "
             f"joints: {listed(model.joints)}"
         )
     if len(gains) == len(model.joints) and not masses:
         raise SettingsError(
-            "all gains are unknown and no mass is known: their scale is not determined; state "
+            "all gains are unknown and no mass is known: their scale is not determined; set "
             "the mass of the payload, or the gain of one joint that it loads"
         )
 

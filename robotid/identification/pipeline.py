@@ -108,7 +108,7 @@ def conclude(
     if model.is_static and any(wanted.values()):
         raise SettingsError(
             "dynamics is 'static', which allows friction 'none' or 'viscous+coulomb' (without "
-            "the viscous term), but more is stated; remove it, or set dynamics = 'full'"
+            "the viscous term), but more is given; remove it, or set dynamics = 'full'"
         )
     report_stage(progress, "fitting")
     try:

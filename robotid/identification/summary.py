@@ -49,14 +49,15 @@ def _mark(metrics: Mapping[str, Any]) -> str:
 
 def friction_lines(friction: Mapping[str, Any]) -> list[str]:
     """Return the friction of joints besides viscous and Coulomb, and its effect, as text."""
-    lines = []
+    words = []
     for joint, choice in friction.items():
         if choice["families"]:
             selected = [step for step in choice["tried"] if step["is_selected"]]
             ends = (step["held_out_error_pct"] for step in (choice["tried"][0], selected[-1]))
-            gain = "held-out error {:.1f} -> {:.1f} %".format(*ends)
-            lines.append(f"  {joint}: {' + '.join(choice['families'])} ({gain})")
-    return ["friction besides viscous and Coulomb:", *lines] if lines else []
+            gain = "{:.1f} -> {:.1f} %".format(*ends)
+            words.append(f"{joint} {' + '.join(choice['families'])} ({gain})")
+    title = "further friction (held-out error)"
+    return [f"{title}: {', '.join(words)}"] if words else []
 
 
 def left_out_lines(logs: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -115,7 +116,7 @@ def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
     for name, joint in verdict["per_joint"].items():
         by_cell.setdefault(verdict_cell(name, joint), []).append(name)
     if list(by_cell) == ["good"]:
-        by_cell = {"good": ["every joint"]}
+        by_cell = {} if verdict["status"] == "good" else {"good": ["every joint"]}
     cells = {words: f"  {', '.join(names)}: {words}" for words, names in by_cell.items()}
     of_joints = {
         joint["reasons"][0]: verdict_cell(name, joint)

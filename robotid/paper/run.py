@@ -20,6 +20,7 @@ from robotid.output.pages.html import (
     listing,
     number,
     page,
+    plain,
     text,
 )
 from robotid.output.viewer.replays import Torques, replay
@@ -62,7 +63,8 @@ _PARAMETERS = (
     ("difference", ".1e", "difference"),
 )  # fmt: skip
 _VECTOR = (
-    ("parameter", "code", "name"), ("true", ".4g", "true"), ("identified", ".7g", "identified"),
+    ("parameter", "code", "name"), ("true", ".4g", "true"), ("identified", ".7g", "value"),
+    ("determined by the torque", "text", "determined"),
 )  # fmt: skip
 _DISTURBED = (
     ("model", "text", "name"), ("case", "text", "case"), ("at the end", ".2g", "last"),
@@ -223,8 +225,10 @@ def _inertial_vector(arm: RobotModel, study: ModelStudy) -> dict[str, Any]:
     W_b = joint_torque_regressor(arm, q, v, a)[:, mapping.independent]  # (40, b)
     u = study.dynamics.torque(q, v, a, study.history.estimates[-1, 0])  # (20, 2)
     beta = np.linalg.lstsq(W_b, u.ravel())[0]
+    names = [f"{body}.{term}" for body in arm.layout.bodies for term in PAPER_TERMS]
     return {
-        "names": [f"{body}.{term}" for body in arm.layout.bodies for term in PAPER_TERMS],
+        "names": names,
+        "sums": [next((x for x in mapping.expressions if name in x.split()), "") for name in names],
         "true": to_paper_order(pi).tolist(),
         "identified": to_paper_order(mapping.to_standard(beta, pi / 2)).tolist(),
     }
@@ -263,15 +267,17 @@ def paper_page(
     result = block("paper.result") + _result_table(content) + _parameter_tables(content)
     figures = _program_figures() + _control_figures(studies) + _estimate_figures(studies)
     disturbed = _disturbance(content) + _disturbed_figures(studies)
+    corrections = block("paper.errata") + listing("Errata", _ERRATA, content["errata"])
     sections = {
-        "result": ("Accuracy of the estimates", result + _vector_table(content)),
+        "result": ("Accuracy of the estimates", result),
+        "vector": ("Inertial vector", _vector_table(content), "three of twenty determined", False),
         "figures": ("The paper's figures", figures),
         "convergence": ("Proximity and error", _convergence_figures(studies)),
-        "disturbance": ("Disturbance and noise", disturbed),
-        "trajectories": ("Random trajectories", _trajectories(content)),
-        "errata": ("Errata", block("paper.errata") + listing("Errata", _ERRATA, content["errata"])),
-        "energy": ("Energy", _energy(*drift)),
-        "settings": ("Settings", _settings(content)),
+        "disturbance": ("Disturbance and noise", disturbed, "of the torque, of the sensors", False),
+        "trajectories": ("Random trajectories", _trajectories(content), "iterations needed", False),
+        "errata": ("Errata", corrections, "equations that need a correction", False),
+        "energy": ("Energy", _energy(*drift), "of free motion", False),
+        "settings": ("Settings", _settings(content), "of this run", False),
     }
     return page("The paper's simulation", _summary(content), sections)
 
@@ -288,11 +294,13 @@ def _summary(content: Mapping[str, Any]) -> str:
         )
         for name, error in last.items()
     )  # fmt: skip
+    count, usual = content["settings"]["iterations"], PaperSettings().iterations
     beside = np.degrees(np.max(np.abs(content["settings"]["start_beside_program_rad"])))
     return block(
         "paper.summary",
         status="good" if max(last.values()) <= _ENOUGH else "poor",
-        count=len(next(iter(models.values()))["relative_error"]) - 1,
+        count=count,
+        trial=block("paper.trial", count=count, usual=usual) if count < usual else "",
         reached=reached,
         beside=f"{beside:.3g}",
         least=f"{min(gains):.2g}",
@@ -318,7 +326,7 @@ def _result_table(content: Mapping[str, Any]) -> str:
 
 
 def _parameter_tables(content: Mapping[str, Any]) -> str:
-    html = ""
+    html = '<div class="plots tables">'
     for name, model in content["models"].items():
         values = zip(model["names"], model["P_true"], model["P_hat"][-1], strict=True)
         rows = [
@@ -326,13 +334,17 @@ def _parameter_tables(content: Mapping[str, Any]) -> str:
             for parameter, P, P_hat in values
         ]
         html += listing(f"{name}: parameters at the end [kg m²]", _PARAMETERS, rows)
-    return html
+    return f"{html}</div>"
 
 
 def _vector_table(content: Mapping[str, Any]) -> str:
     vector = content["inertial_vector"]
-    values = zip(vector["names"], vector["true"], vector["identified"], strict=True)
-    rows = [{"name": name, "true": pi, "identified": x} for name, pi, x in values]
+    rows = [
+        {"name": name, "true": vector["true"][k],
+         "value": vector["identified"][k] if known == name else None,
+         "determined": "yes" if known == name else f"only {known}" if known else "no"}
+        for k, (name, known) in enumerate(zip(vector["names"], vector["sums"], strict=True))
+    ]  # fmt: skip
     return block("paper.vector") + listing("Inertial vector (9)-(10), SI units", _VECTOR, rows)
 
 
@@ -375,14 +387,8 @@ def _settings(content: Mapping[str, Any]) -> str:
     for key, value in content["settings"].items():
         words, _, unit = key.rpartition("_")
         name = f"{words} [{unit}]" if unit in ("rad", "s") else key
-        rows.append({"name": name.replace("_", " "), "value": _written(value)})
+        rows.append({"name": name.replace("_", " "), "value": plain(value)})
     return listing("Settings", _SETTINGS, rows)
-
-
-def _written(value: object) -> str:
-    if isinstance(value, list):
-        return ", ".join(map(_written, value))
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 # ---- figures --------------------------------------------------------------------------------
@@ -436,8 +442,8 @@ def _control_figures(studies: Sequence[ModelStudy]) -> str:
             series = [*_lines(drawn), Series("program control", program[:-1, j], "text")]
             less = _lines({name: u - last for name, u in drawn.items()})
             label = f"torque u{j + 1} [N m]"
-            charts.append(Chart(title, t[:-1], tuple(series), "time [s]", label))
-            charts.append(Chart(f"{title}, minus the last", t[:-1], tuple(less), "time [s]", label))
+            for what, lines in ((title, series), (f"{title}, minus the last", less)):
+                charts.append(Chart(what, t[:-1], tuple(lines), "time [s]", label, height=120))
     return _plots(*charts)
 
 

@@ -217,7 +217,7 @@ def check_constraints(
                 )
     stated = [constraint.frames for constraint in constraints]
     if twice := [x for k, x in enumerate(stated) if x in stated[:k]]:
-        raise ModelError(f"the contact or loop at {listed(twice[0])} is stated twice; remove one")
+        raise ModelError(f"the contact or loop at {listed(twice[0])} is given twice; remove one")
     for name, terms in own_terms.items() if constraints else ():
         if loaded := [term.name for term in terms if term.needs_load]:
             raise SettingsError(

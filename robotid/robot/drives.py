@@ -534,7 +534,7 @@ def wanted_families(
     unknown_joints = [joint for joint in stated if joint not in (*joints, "*")]
     if unknown_joints:
         raise SettingsError(
-            f"friction is stated for {listed(unknown_joints)}, expected joints that are "
+            f"friction is given for {listed(unknown_joints)}, expected joints that are "
             f"identified: {listed(joints)}"
         )
     wanted: dict[str, tuple[str, ...] | None] = {}

@@ -93,7 +93,7 @@ class ParameterLayout:
             if not any(ratio for _, ratio in coupling.ratios):
                 raise SettingsError(
                     f"coupling {coupling.name!r} moves no joint: its ratios are "
-                    f"{dict(coupling.ratios)}, expected one that is not 0; state it, for example "
+                    f"{dict(coupling.ratios)}, expected one that is not 0; set it, for example "
                     f"ratios = {{ {self.joints[0]} = 1.0 }}, or omit the coupling"
                 )
             if sum(drive.name == coupling.name for drive in self.drives) > 1:
@@ -111,12 +111,12 @@ class ParameterLayout:
         drives = [drive.name for drive in self.drives]
         if unknown := [name for name in self.own if name not in drives]:
             raise SettingsError(
-                f"terms are stated for {listed(unknown)}, expected drives: {listed(drives)}"
+                f"terms are given for {listed(unknown)}, expected drives: {listed(drives)}"
             )
         names = self.drive_names
         if len(set(names)) < len(names):
             twice = sorted({name for name in names if names.count(name) > 1})
-            raise SettingsError(f"{listed(twice)} is stated twice for one drive; remove one")
+            raise SettingsError(f"{listed(twice)} is given twice for one drive; remove one")
 
     @property
     def n_inertial(self) -> int:

@@ -309,7 +309,7 @@ def choose_joints(
     _check_joints(tree, [*(joints or ()), *(name for name in locked if name != "*")], followers)
     if joints is None and "*" in locked:
         raise ModelError(
-            "locked has '*' (all joints that are not named), but joints is not stated; list the "
+            "locked has '*' (all joints that are not named), but joints is not given; list the "
             "joints to identify in joints"
         )
     moving = tuple(name for name in free if name not in locked) if joints is None else tuple(joints)

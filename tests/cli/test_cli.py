@@ -115,4 +115,6 @@ def test_demo_runs_from_nothing_and_finds_the_truth(tmp_path, capsys, monkeypatc
     links = re.findall(r'<a href="([^"#]+)"', (out / "report.html").read_text(encoding="utf-8"))
     assert len(set(links)) == 4
     assert {name for name in links if (out / name).is_file()} == set(links)
-    assert str(out / "report.html") in printed
+    assert f"written to {out}: report.html, " in " ".join(printed.split())
+    assert len(printed.splitlines()) <= 40, "one screen"
+    assert "payload of known mass" not in printed, "the scale of simulated torques is known"

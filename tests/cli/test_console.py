@@ -78,7 +78,7 @@ def test_a_result_names_recordings_with_their_windows_and_commands_that_work(arm
     notes = sum(warning["severity"] == "note" for warning in result["warnings"])
     assert notes
     flat = " ".join(said.split())
-    assert f"{notes} note{'s' * (notes > 1)} hidden (--verbose)" in flat
+    assert f"{notes} note{'s' * (notes > 1)} (--verbose)" in flat
     assert "\nnote: " not in said
     assert said.count("\x1b") == 0
     assert re.search(r"\nnext steps:\n  1\. [^\n]+\n", said)
@@ -130,7 +130,7 @@ def test_findings_are_told_by_cause_and_the_worst_joint_is_named(capsys):
     assert capsys.readouterr().out.splitlines() == [
         "warning: stepped: run.csv: 20 % of arm_6, arm_7's torque is odd",
         "warning: odd: run.csv: 37 to 68 % of arm_6, arm_7's torque is odd",
-        "2 findings, 2 causes; worst: arm_7; 1 note hidden (--verbose)",
+        "2 warnings, 1 note (--verbose); worst: arm_7",
     ]
     findings.append(finding("arm_1", "reversed", 1, "error"))  # graver than any two warnings
     doctor._show(findings, joints, {}, is_verbose=True, count=2)
@@ -138,7 +138,7 @@ def test_findings_are_told_by_cause_and_the_worst_joint_is_named(capsys):
     assert lines[0] == "error: reversed: run.csv: 1 % of arm_1's torque is odd"
     assert lines[-2:] == [
         "note: noise: run.csv: 1 % of arm_1's torque is odd",
-        "4 findings, 4 causes; worst: arm_1",
+        "1 error, 2 warnings, 1 note; worst: arm_1",
     ]
     wrong = [finding("arm_6", code, 1, "error") for code in ("one", "two")]
     wrong += [finding("arm_7", code, 9) for code in ("three", "four")]

@@ -22,7 +22,7 @@ WORDS = [
         (["--clearance", "near"], "--clearance 'near': expected metres, or none"),
         (["--box", "post=1,2,3"], "--box 'post=1,2,3': expected NAME=x0,y0,z0,x1,y1,z1"),
         (["--duration", "-1"], "duration is -1.0, expected 0.1 to 3600 s"),
-        (["--max-jerk", "elbow=3"], "jerk is stated for 'elbow', which is not a moving joint"),
+        (["--max-jerk", "elbow=3"], "jerk is given for 'elbow', which is not a moving joint"),
         (["--noise", "wrist_1_joint=-1"], "of 'wrist_1_joint' is -1, expected 1e-09 to 1e+12"),
         (["--harmonics", "1"], "harmonics is 1, expected 2 to 100"),
         (["--harmonics", "100000"], "harmonics is 100000, expected 2 to 100"),

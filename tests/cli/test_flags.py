@@ -116,7 +116,7 @@ def test_a_job_file_takes_neither_logs_nor_flags_beside_it():
         (["run.csv"], "run.csv"),
         (["--cutoff", "5", "--validate", "b.csv"], "--validate, --cutoff"),
     ):
-        with pytest.raises(SettingsError, match=f"settings. Remove {given}, and state them in"):
+        with pytest.raises(SettingsError, match=f"settings. Remove {given}, and set them in"):
             job_from_flags(parsed(identify, "job.toml", *words))
 
 
@@ -138,7 +138,7 @@ def test_a_flag_is_stated_once_and_validation_logs_add_up(capsys):
             parser.parse_args(
                 ["r.urdf", "a.csv", flag, "6" if value == "5" else value, flag, value]
             )
-        assert f"argument {flag}: stated twice, as " in capsys.readouterr().err
+        assert f"argument {flag}: given twice, as " in capsys.readouterr().err
 
 
 def printed(capsys, *words):

@@ -36,7 +36,7 @@ def test_the_error_of_a_robot_at_rest_carries_what_the_doctor_found(arm, rng, tm
     with pytest.raises(DataError, match="0 torque rows") as caught:
         run_job(job, tmp_path / "out")
     notes = caught.value.__notes__
-    assert any("static_joint" in note and "joint_2 at rest (range 0 rad)" in note for note in notes)
+    assert any("static_joint" in note and "motion of joint_2 (range 0" in note for note in notes)
     out = ["--out", str(tmp_path / "out")]
     assert main(["identify", arm.tree.path, str(tmp_path / "rest.csv"), *out]) == 1
     lines = capsys.readouterr().err.splitlines()
@@ -159,8 +159,8 @@ def test_a_job_file_and_its_settings_in_python_find_the_same(arm, arm_logs, tmp_
     codes = [[f.code for f in robotid.doctor(*given)] for given in ((job,), (urdf, log))]
     assert codes[0] == codes[1]
     for given, options, words in (
-        (job, {"signals": robotid.SignalSettings()}, "state validation, signals, controller"),
-        (job, {"validation": log}, "state validation"),
+        (job, {"signals": robotid.SignalSettings()}, "set validation, signals, controller"),
+        (job, {"validation": log}, "set validation"),
         (urdf, {}, "no log is given"),
     ):
         with pytest.raises(SettingsError, match=words):

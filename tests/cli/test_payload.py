@@ -151,7 +151,7 @@ def test_what_is_missing_is_named(files, capsys):
     said = asked(capsys, bare, "--reference", loaded, "--link", "tool0", *STATED, code=1)
     assert "less than in the reference" in said
     said = asked(capsys, loaded, "--reference", files / "out", "--cutoff", "5", code=2)
-    assert "a RESULT states how its logs are read; remove --cutoff" in said
+    assert "a RESULT has the settings of its logs; remove --cutoff" in said
     said = asked(capsys, loaded, "--reference", files / "out", "--reference", bare, code=2)
     assert "expected one result alone, or logs" in said
     said = asked(capsys, loaded, "--reference", bare, "--mass", "heavy", code=2)
@@ -216,7 +216,7 @@ def test_wrong_words_are_answered(files, capsys):
     assert "Did you mean 'elbow_joint'" in error
     assert "expected JOINT=NUMBER" in previewed(capsys, motion, "--noise", "elbow_joint", code=2)
     error = previewed(capsys, motion, "--given", files / "out", "--cutoff", "5", code=2)
-    assert "a RESULT states how its logs are read" in error
+    assert "a RESULT has the settings of its logs" in error
     write_columns({"time": np.arange(9.0), "q_a": np.zeros(9)}, files / "other_robot.csv")
     error = previewed(capsys, files / "other_robot.csv", code=1)
     assert '# q_shoulder_pan_joint = "NAME"' in error

@@ -38,7 +38,7 @@ SUSPECTED = [
      "position looks like degrees"),
     (dict(v=V * 180 / np.pi), "angle_unit", "dq_a is 57.3 times d(q)/dt: the velocity looks like "
      "degrees, the other like radians. Convert one of them in the recording. To read the values "
-     'without conversion, state units angle = "rad" (job file table [units], CLI --angle-unit rad'),
+     'without conversion, set units angle = "rad" (job file table [units], CLI --angle-unit rad'),
     (dict(v=V * [1.0, -1.0]), "velocity_sign", "dq_b has the opposite sign of d(q)/dt of q_b. "
      "Negate one of them in the recording, or leave the dq columns out"),
     (dict(t=T * 1e3, v=None), "time_unit", "median step 10 looks like milliseconds (100 Hz); in "
@@ -155,8 +155,8 @@ def test_one_joint_in_degrees_is_converted_alone():
     ):
         with pytest.raises(DataError, match=re.escape(advice.format(columns))) as caught:
             check_units(three(**changes), LogUnits())
-        assert "in the recording, because a stated unit applies to all joints" in str(caught.value)
-        assert '. If all joints are in degrees, state units angle = "deg"' in str(caught.value)
+        assert "in the recording, because the unit applies to all joints" in str(caught.value)
+        assert '. If all joints are in degrees, set units angle = "deg"' in str(caught.value)
     a = 180 / np.pi * np.array([1.0, 0.0, 0.0]) + [0.0, 1.0, 1.0]
     with pytest.raises(DataError, match=r"most 1\.51: this joint alone .* multiply qref_a by"):
         check_units(three(one, q_ref=a), LogUnits())

@@ -53,7 +53,7 @@ def test_the_pose_of_the_root_follows_from_that_of_a_moving_link(robot, link, ha
     found = closed.base
     assert found.imu is imu
     if link != "base_link":
-        assert closed.notes[-1] == f"the pose of the base is computed from that of {link}"
+        assert closed.notes[-1] == f"the pose of the base is computed from the pose of {link}"
     assert found.link == ""
     signs = np.sign(np.sum(found.pose[:, 3:] * roots[:, 3:], axis=1))
     np.testing.assert_allclose(found.pose[:, 3:], signs[:, None] * roots[:, 3:], atol=1e-12)

@@ -296,5 +296,5 @@ def test_a_contact_of_an_unknown_link_is_refused():
     words = r"'FL_FOTO', which is not a link of solo12.urdf.*'FL_FOOT'"
     with pytest.raises(ModelError, match=words):
         RobotModel.from_urdf(urdf, free_flyer=True, constraints=[Contact("FL_FOTO")])
-    with pytest.raises(ModelError, match="the contact or loop at FL_FOOT is stated twice"):
+    with pytest.raises(ModelError, match="the contact or loop at FL_FOOT is given twice"):
         RobotModel.from_urdf(urdf, constraints=[Contact("FL_FOOT"), Contact("FL_FOOT", "surface")])

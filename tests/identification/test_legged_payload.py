@@ -159,7 +159,7 @@ def test_a_moving_joint_without_a_torque_column_is_proposed_as_passive(cartpole,
     table = np.column_stack([log.t, log.q, log.tau[:, 0]])
     file, names = tmp_path / "log.csv", "time,q_slider,q_hinge,tau_slider"
     np.savetxt(file, table, delimiter=",", header=names, comments="", fmt="%.9g")
-    with pytest.raises(DataError, match=r'no drive, state passive = \["hinge"\]') as caught:
+    with pytest.raises(DataError, match=r'no drive, set passive = \["hinge"\]') as caught:
         read_log(file, ["slider", "hinge"])
     assert "lock" not in str(caught.value)
     assert read_log(file, ["slider", "hinge"], passive=["hinge"]).joints == ("slider", "hinge")

@@ -235,9 +235,9 @@ def test_what_cannot_be_asked_is_refused_by_name(ur5, rng):
             links=["tool0", "ee_link"])  # fmt: skip
     refused(ModelError, "link 'hook' is not in ur5_robot.urdf; links: ", links=["hook"])
     refused(SettingsError, "their scale is not determined", unknown_gains=ur5.joints)
-    refused(SettingsError, "a mass is stated for ee_link", masses={"ee_link": 1.0})
+    refused(SettingsError, "a mass is given for ee_link", masses={"ee_link": 1.0})
     refused(SettingsError, "is -1.0 kg", masses={"wrist_3_link": -1.0})
-    refused(SettingsError, "unknown gains are stated for hip", unknown_gains=["hip"])
+    refused(SettingsError, "unknown gains are given for hip", unknown_gains=["hip"])
     short = [x.window(0.0, 1.0) for x in (log, without)]
     refused(
         DataError, "the motion does not determine the mass of the payload on wrist_3_link", short

@@ -100,10 +100,16 @@ def test_the_inertial_vector_is_in_the_papers_order(shown, written, html):
     back = [10 * i + order.index(term) for i in (0, 1) for term in INERTIAL_TERMS]
     true, found = (np.array(vector[key])[back] for key in ("true", "identified"))
     np.testing.assert_allclose(true, np.concatenate(urdf), atol=1e-14)
-    assert shown["Inertial vector (9)-(10), SI units"].rows == [
-        [name, number(a), number(b, ".7g")]
-        for name, a, b in zip(vector["names"], vector["true"], vector["identified"], strict=True)
+    rows = shown["Inertial vector (9)-(10), SI units"].rows
+    assert [row[:2] for row in rows] == [
+        [name, number(a)] for name, a in zip(vector["names"], vector["true"], strict=True)
     ]
+    alone = [f"link_2.{term}" for term in ("Izz", "mcx", "mcy")]
+    for (name, _, value, determined), b in zip(rows, vector["identified"], strict=True):
+        assert value == number(b if name in alone else None, ".7g")
+        is_in_sum = name in ("link_1.Izz", "link_2.m")
+        words = "only link_1.Izz + link_2.m" if is_in_sum else "no"
+        assert determined == ("yes" if name in alone else words)
 
     def four_sums(pi):
         """(27), from inertia about the joints: P of the physical arm, whose links are 1 m long."""
@@ -128,7 +134,11 @@ def test_the_page_is_good_only_if_every_model_has_converged(written, shown):
             name: {**model, "relative_error": [0.5, error]}
             for (name, model), error in zip(content["models"].items(), last, strict=True)
         }
-        assert f'class="verdict {status}"' in paper._summary({**content, "models": models})
+        summary = paper._summary({**content, "models": models})
+        assert f'class="verdict {status}"' in summary
+        assert "trial</strong> with 19 iterations in place of 100 (--quick)" in summary
+    settings = content["settings"] | {"iterations": 100}
+    assert "trial" not in paper._summary({**content, "settings": settings})
 
 
 def test_a_case_is_judged_at_its_end_by_a_tenth_and_by_the_mean_of_the_later_half(rng):

@@ -252,7 +252,7 @@ def test_terms_of_one_drive_stand_side_by_side():
     ]  # fmt: skip
     plain = model.with_terms({})
     assert list(plain.layout.drive_names) == of_joints + shared
-    with pytest.raises(SettingsError, match="terms are stated for wrist_9, expected drives"):
+    with pytest.raises(SettingsError, match="terms are given for wrist_9, expected drives"):
         model.with_terms({"wrist_9": [Cubic()]})
 
 

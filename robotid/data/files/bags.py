@@ -79,7 +79,7 @@ class _Bag:
         if count and not is_stamped:
             raise DataError(
                 f"{self.path.name}, topic {topic!r}: the header stamps of all {count} messages are "
-                '0. To use the time of recording, state stamp = "log" (job file table [log], CLI '
+                '0. To use the time of recording, set stamp = "log" (job file table [log], CLI '
                 '--stamp log, Python source=LogSource(stamp="log"))'
             )
 
@@ -310,10 +310,9 @@ def _read(where: str, blocks: dict[Layout, _Block], wanted: Sequence[str]) -> di
     if lacking:
         first = min(lacking)
         raise DataError(
-            f"{where}: {sum(n for _, n in lacking.values())} of {len(number)} messages lack some "
-            f"of the required values, the first (message {first}) lacks "
-            f"{listed(lacking[first][0])}. A row is one message; read only joints that are always "
-            "published together, and leave out the others"
+            f"{where}: {sum(n for _, n in lacking.values())} of {len(number)} messages lack some, "
+            f"message {first} lacks {listed(lacking[first][0])}. A row is one message; "
+            "read only joints that are always published together"
         )
     order = np.argsort(number)
     parts: dict[str, list[Array]] = {name: [] for name in wanted}
@@ -386,12 +385,12 @@ def _sensors_of(bag: _Bag) -> list[_Sensor]:
     for topic in stated:
         if topic not in types:
             raise DataError(
-                f"{where} has no message of a topic {topic!r}, which sensors states; topics: "
+                f"{where} has no message of a topic {topic!r}, given in sensors; topics: "
                 f"{dict(sorted(types.items()))}{suggestion(topic, types)}"
             )
         if types[topic] not in _SENSORS and not _is_low_state(types[topic]):
             raise DataError(
-                f"{where}: topic {topic!r}, which sensors states, has messages of {types[topic]}, "
+                f"{where}: topic {topic!r}, given in sensors, has messages of {types[topic]}, "
                 f"expected one of {listed([*_SENSORS, 'unitree_go/msg/LowState'])}"
             )
     sensors = []
@@ -417,7 +416,7 @@ def _with_sensors(
             topics = [sensor.topic for sensor in by_column[name]]
             if len(topics) > 1:
                 raise DataError(
-                    f"{path.name} has {len(topics)} topics with {name}: {listed(topics)}. State "
+                    f"{path.name} has {len(topics)} topics with {name}: {listed(topics)}. Set "
                     f'all topics of sensors to read: sensors = ["{topics[0]}"] (job file table '
                     "[log], Python source=LogSource(sensors=...))"
                 )
@@ -429,10 +428,9 @@ def _with_sensors(
             inside &= (rows["time"] >= t[0]) & (rows["time"] <= t[-1])
             if not inside.any():
                 raise DataError(
-                    f"{path.name}: no message of the joints lies between the first and the last "
-                    f"message of topic {topic!r}, {t[0]:.3f} s to {t[-1]:.3f} s; the joints have "
-                    f"{rows['time'][0]:.3f} s to {rows['time'][-1]:.3f} s. If the stamps are of "
-                    'different clocks, state stamp = "log"'
+                    f"{path.name}: topic {topic!r} has times {t[0]:.3f} s to {t[-1]:.3f} s, "
+                    f"the joints {rows['time'][0]:.3f} s to {rows['time'][-1]:.3f} s. If these "
+                    'are different clocks, set stamp = "log"'
                 )
         rows = {name: values[inside] for name, values in rows.items()}
         for topic, (t, values) in loaded.items():

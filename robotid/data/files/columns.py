@@ -282,7 +282,7 @@ class Finder:
         if (clock := self._find("time", self._clocks())) is None:
             raise DataError(
                 f"{self.where} has no column 'time'; columns found: {listed(self.names)}. Rename "
-                'it, or state in the job file: columns = { time = "NAME" }, or without time stamps '
+                'it, or set in the job file: columns = { time = "NAME" }, or without time stamps '
                 "the rate of the rows [Hz]: log = { rate = 100 }",
                 code="missing_column",
             )
@@ -397,7 +397,7 @@ class Finder:
                 )
             if name not in self.names:
                 raise DataError(
-                    f"{self.where} has no column {name!r}, which is stated for {standard!r} in "
+                    f"{self.where} has no column {name!r}, which is given for {standard!r} in "
                     f"columns; columns found: {listed(self.names)}{suggestion(name, self.names)}"
                 )
 
@@ -412,7 +412,7 @@ class Finder:
                 if other != place:
                     raise SettingsError(
                         f"{self.where}: joints {other} and {place} have the same name "
-                        f"{self._named(place)!r} in the log; state another one in [log.joints], "
+                        f"{self._named(place)!r} in the log; set another one in [log.joints], "
                         f"or by --rename {place}=NAME"
                     )
 
@@ -424,7 +424,7 @@ class Finder:
         if len(found) > 1:
             raise DataError(
                 f"{self.where} has {found[0]!r} and {found[1]!r}, two names of the same quantity; "
-                f"remove one, or state in the job file columns = {{ {toml_key(standard)} = "
+                f"remove one, or set in the job file columns = {{ {toml_key(standard)} = "
                 f"{quoted(found[0])} }}"
             )
         self.seen.update(found)
@@ -496,7 +496,7 @@ class Finder:
             f"positions, as with {locks}"
         )
         return DataError(
-            f"{self.where}: {has} but no gain; state it in N m/A: {flags}, or in the job file "
+            f"{self.where}: {has} but no gain; set it in N m/A: {flags}, or in the job file "
             f"[torque] gains = {{ {gains} }}{also if absent else ''}. A payload of known mass "
             "determines unknown gains: robotid payload URDF LOADED --reference BARE --mass KG "
             "--gains",
@@ -593,7 +593,7 @@ class Finder:
                 "each line, an exchange of joints gives wrong parameters"
             )
         return DataError(
-            f"{text} {remedy}. Rename the columns, or state them in the job file:\n[columns]\n"
+            f"{text} {remedy}. Rename the columns, or set them in the job file:\n[columns]\n"
             + "\n".join(lines),
             code="missing_column",
         )
@@ -615,7 +615,7 @@ class Finder:
         """Return what to do if no column is similar to a missing one."""
         if at_motors := [name for name in self.names if name.startswith(("qm_", "taum_"))]:
             return (
-                f"For columns of motors, as {at_motors[0]}, state [[transmission]] with joints "
+                f"For columns of motors, as {at_motors[0]}, add [[transmission]] with joints "
                 "and matrix"
             )
         kind, joints = absent[0][0], [joint for _, joint in absent]
@@ -629,7 +629,7 @@ class Finder:
         if leaders := {x.name: x.mimic[0] for x in self.robot if x.mimic and x.name in at_rest}:
             moved = ", ".join(f"{joint} mimics {leader}" for joint, leader in leaders.items())
             return (
-                f"{moved}: a joint that moves with its leader needs no column; state mimic = "
+                f"{moved}: a joint that moves with its leader needs no column; set mimic = "
                 '"coupled" in the job file'
             )
         moving = []
@@ -638,7 +638,7 @@ class Finder:
             moving = [joint for joint, column in columns.items() if column and moves(joint, column)]
         if moving:
             return (
-                f"If {listed(moving)}, which moves in the log, has no drive, state passive = "
+                f"If {listed(moving)}, which moves in the log, has no drive, set passive = "
                 f"[{', '.join(map(quoted, moving))}] in the job file; else record its torque"
             )
         locks = " ".join(f"--lock {joint}=0" for joint in at_rest)

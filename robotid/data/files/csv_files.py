@@ -168,7 +168,7 @@ def _header(
         likely = ["time"] * (len(names) % 2)
         likely += [f"{kind}_{k}" for kind in ("q", "tau") for k in half]
         raise DataError(
-            f"{path.name} has no header. State the names of its {len(names)} columns in the job "
+            f"{path.name} has no header. Set the names of its {len(names)} columns in the job "
             "file, and the rate of its rows if none of them is the time. An example:\n"
             f"[log]\nnames = [{', '.join(map(quoted, likely))}]"
             + "\nrate = 100  # [Hz]"

@@ -189,12 +189,10 @@ _FEATURES: Mapping[str, Mapping[str, str]] = {
                "torque": "tauref", "tau": "tauref", "effort": "tauref"},
 }  # fmt: skip
 _NORMALISED = (
-    "the unit of positions is not in the files of LeRobot. By version and use_degrees of the "
-    "robot, they are degrees, or normalised: -100 to 100 over the calibrated range of each joint, "
-    "which is no angle (a gripper always has 0 to 100). Normalised positions: record with "
-    "use_degrees = true, or convert them with the calibration of the robot. If "
-    'they are angles, state the unit: angle = "deg" or "rad" (job file table [units], CLI '
-    '--angle-unit deg, Python units=LogUnits(angle="deg"))'
+    "LeRobot's files lack the unit of positions: degrees, or normalised positions, -100 to 100 "
+    "over the calibrated range (a gripper: 0 to 100). Record normalised positions again with "
+    'use_degrees = true. For angles, set the unit: angle = "deg" or "rad" (job file table [units], '
+    'CLI --angle-unit deg, Python units=LogUnits(angle="deg"))'
 )
 _Place = tuple[str, int]  # a feature, and the number of a value in its vectors
 

@@ -301,7 +301,7 @@ def _require_rate(values: Array, names: Sequence[str], where: str) -> None:
         sparse = [name for name, own in zip(names, share, strict=True) if own > _SPARSE]
         raise DataError(
             f"{where}: {share.max():.0%} of the rows have no value of {listed(sparse)}, as of "
-            "another rate than that of the joints; interpolate at the time stamps of the joints, "
+            "another rate than the joints'; interpolate at the time stamps of the joints, "
             "or keep the rows that have all values"
         )
 
@@ -408,7 +408,7 @@ def _notes_of_sensors(
     if forces and links and table.axes.get("wrench") == "link":
         raise DataError(
             f"{where}: {listed(forces)} have the axes of their frames, but [[contact]] of "
-            f"{listed(sorted(links))} states those of the world; state axes = 'link'"
+            f"{listed(sorted(links))} has the axes of the world; set axes = 'link'"
         )
     used = [table.sensors[x] for own in columns.values() for x in own if x in table.sensors]
     if not used:

@@ -226,7 +226,7 @@ def with_stated_names(table: Table, where: str, names: Sequence[str]) -> Table:
     """Return a table with the names that a job states for all columns, in their order."""
     if names and len(names) != len(table.names):
         raise DataError(
-            f"{where} has {len(table.names)} columns, but log.names states {len(names)}; name "
+            f"{where} has {len(table.names)} columns, but log.names has {len(names)}; name "
             "each column, in their order"
         )
     return table.with_names(dict(zip(table.names, names, strict=True))) if names else table
@@ -283,7 +283,7 @@ def choose(where: str, candidates: Sequence[str], noun: str, listing: str) -> st
         return candidates[0]
     names = sorted(candidates)
     raise DataError(
-        f"{where} has {len(names)} {noun}: {listed(names)}; {listing}. State one: topic = "
+        f"{where} has {len(names)} {noun}: {listed(names)}; {listing}. Set one: topic = "
         f'"{names[0]}" (job file table [log], CLI --topic, Python source=LogSource(topic=...))'
     )
 

@@ -275,8 +275,7 @@ def percent_hint(model: RobotModel, name: str, position: float, units: LogUnits)
     low, high = joint.lower, joint.upper
     unit = "m" if joint.type == "prismatic" else "rad"
     return (
-        f". If {logged:.4g}, the number in the log, is a percentage, as of LeRobot's grippers, "
-        f"state percent = {{ {toml_key(name)} = [{low:.4g}, {high:.4g}] }} in [units], the "
-        f"positions at 0 and at 100 [{unit}]: it then is at "
-        f"{low + (high - low) * logged / 100:.4g} {unit}"
+        f". If {logged:.4g}, the number in the log, is a percentage, as of LeRobot's grippers, set "
+        f"percent = {{ {toml_key(name)} = [{low:.4g}, {high:.4g}] }} in [units], the positions at "
+        f"0 and at 100 [{unit}]: it then is at {low + (high - low) * logged / 100:.4g} {unit}"
     )

@@ -348,7 +348,7 @@ def _cure(fit: Fit, body: str, excess: float = 0.0) -> str:
     cure = "Record motion about more axes, or pin it to the URDF"
     for stated, mass in _stated_of(fit, body).items():
         limit = f" (possible: up to about {mass - excess:.3g} kg)" * (excess > 0)
-        cure = f"Check the stated {stated} of {mass:.4g} kg{limit}: weigh it, or remove it"
+        cure = f"Check the given {stated} of {mass:.4g} kg{limit}: weigh it, or remove it"
     return cure
 
 

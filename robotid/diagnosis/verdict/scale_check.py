@@ -76,7 +76,7 @@ class StatedMass(KnownMass):
     ratio: float | None = None  # mass that torque alone determines, over the stated one [-]
     half_width: float = 0.0  # of its 95 % interval, plus that of the stated range [-]
     absorbed_by: tuple[str, ...] = ()  # links that take up the mass while no torque changes
-    kind: ClassVar[str] = "stated mass"
+    kind: ClassVar[str] = "given mass"
 
     @property
     def status(self) -> str:

@@ -49,7 +49,7 @@ _OF_THE_FIT = ("all joints", "estimator", "recordings", "standard_parameters")
 _SIMPLER = {
     "command": "the command itself",
     "second_order": "a second-order model",
-    "urdf": "the URDF with the stated gains",
+    "urdf": "the URDF with the given gains",
     "rows": "the fit to torques alone",
     "steady": "constant velocity from the start",
 }
@@ -379,8 +379,8 @@ def judge(
             _ranked(one.poor),
             [*one.cautions, *_described([w for w in of_torque if w.joint in ("", joint)])],
             is_tested=bool(one.errors),
-            checked=f"error at most {max(one.errors):.1f} %, smaller than that of a constant and "
-            "that of the URDF"
+            checked=f"error at most {max(one.errors):.1f} %, smaller than with a constant torque "
+            "and with the URDF"
             if one.errors
             else predictions.why_untested(joint),
         )
@@ -392,8 +392,8 @@ def judge(
     errors = {joint: max(one.errors, default=0.0) for joint, one in evidence.items()}
     good = (
         f"torque prediction error on {logs_that_test(predictions.validation)}: at most "
-        f"{max(errors.values(), default=0.0):.1f} % at every joint, smaller than that of a "
-        "constant and that of the URDF; all parameters are physically consistent"
+        f"{max(errors.values(), default=0.0):.1f} % at every joint, smaller than with a "
+        "constant torque and with the URDF; all parameters are physically consistent"
     )
     poor = _ranked(reason for one in largest for reason in one.poor)
     verdict = concluded(
@@ -584,9 +584,9 @@ def judge_positions(
     warnings = [*cautions, *([] if is_validation else [unseen])]
     warnings += [] if is_settled else ["the fit has not converged"]
     good = (
-        f"simulated position error on validation logs: at most "
-        f"{max(errors.values(), default=0.0):.2g} % of each joint's RMS motion, smaller than those "
-        "of simpler models"
+        "simulated position error on validation logs: at most "
+        f"{max(errors.values(), default=0.0):.2g} % of each joint's RMS motion, smaller than with "
+        "simpler models"
     )
     verdict = concluded(
         verdicts, poor=reasons["poor"], good=good, notes=[scale] if scale else [],

@@ -418,8 +418,8 @@ def why_no_solution(
     return (
         f"the simulation of {name} has no solution in steps of {step:g} s: its gain kp is {kp:.3g} "
         f"and its inertia {inertia:.3g}, expected kp below {inertia / step**2:.3g} (inertia / "
-        "step^2) and friction that opposes motion. State gains in [controller] that are closer to "
-        "those of the drive, or a smaller step in [estimator]"
+        "step^2) and friction that opposes motion. Set gains in [controller] that are closer to "
+        "the drive's, or a smaller step in [estimator]"
     )
 
 
@@ -454,10 +454,9 @@ def _slow_rate(loops: Loops, rate: float, names: list[str], joints: Array, M: Ar
     least = 0.5 * np.linalg.eigvals(np.linalg.solve(M, np.diag(kd))).real.max()
     least = max([least, *(0.5 * kp[kd > 0] / kd[kd > 0])])
     return (
-        f"the simulation of {listed(names)} is unstable: the controller's rate of {rate:g} Hz is "
-        f"too low. Gains kp {listed(f'{x:.3g}' for x in kp)} and kd "
-        f"{listed(f'{x:.3g}' for x in kd)} need about {least:.3g} Hz with these inertias. "
-        "State the sampling rate of the drives' controllers in [controller], or leave it out"
+        f"the simulation of {listed(names)} is unstable: the controller's rate is {rate:g} Hz, "
+        f"expected about {least:.3g} Hz with kp {listed(f'{x:.3g}' for x in kp)} and kd "
+        f"{listed(f'{x:.3g}' for x in kd)}. Correct rate in [controller], or leave it out"
     )
 
 

@@ -76,7 +76,7 @@ class Truth(Settings):
         among=("usual", "none"),
     )
     values: Mapping[str, float] = setting(
-        {}, 'stated standard parameters, by name, for example "elbow.viscous" [SI units]'
+        {}, 'given standard parameters, by name, for example "elbow.viscous" [SI units]'
     )
 
 
@@ -107,7 +107,7 @@ class Controller(Settings):
         if self.kind in ("computed_torque", "perfect") and not (self.kp is self.kd is None):
             raise SettingsError(
                 f"controller: kp and kd apply to kind pd or feedforward, not {self.kind}. Leave "
-                "them out" + ("" if self.kind == "perfect" else ", or state bandwidth")
+                "them out" + ("" if self.kind == "perfect" else ", or set bandwidth")
             )
 
 
@@ -131,7 +131,7 @@ class Actuator(Settings):
         within=Range("positive numbers by joint", _all_of(lambda x: x > 0)),
     )
     stiffness: PerJoint | None = setting(
-        None, "stiffness of elastic gears [N m/rad or N/m]; rigid gears if not stated", **GAIN
+        None, "stiffness of elastic gears [N m/rad or N/m]; default: rigid gears", **GAIN
     )
     damping: PerJoint = setting(0.0, "damping of elastic gears [N m s/rad or N s/m]", **LEVEL)
     backlash: PerJoint = setting(
@@ -143,7 +143,7 @@ class Actuator(Settings):
         if self.stiffness is None and (self.damping or self.backlash):
             what = "damping" if self.damping else "backlash"
             raise SettingsError(
-                f"actuator: {what} applies only to elastic gears. State their stiffness, for "
+                f"actuator: {what} applies only to elastic gears. Set their stiffness, for "
                 "example stiffness = 2e4 [N m/rad]"
             )
 
@@ -204,7 +204,7 @@ class Payload(Settings):
 
     _table: ClassVar[str] = "payload"
 
-    link: str = setting("", "name of the link; the last moving one if not stated")
+    link: str = setting("", "name of the link; default: the last moving link")
     mass: float = setting(
         0.0, "mass [kg]; 0: no payload", within=Range("0 to 1e9 kg", lambda x: 0 <= x <= 1e9)
     )
@@ -232,7 +232,7 @@ class Simulation(Settings):
         1000.0, "rate of the log [Hz]", within=Range("1e-3 to 1e5", lambda x: 1e-3 <= x <= 1e5)
     )
     duration: float | None = setting(
-        None, "length of the log [s]; that of the motion if not stated", within=POSITIVE
+        None, "length of the log [s]; default: the length of the motion", within=POSITIVE
     )
     truth: Truth = setting(Truth(), "differences of the true robot from its URDF")
     controller: Controller = setting(Controller(), "controller that tracks the motion")
@@ -260,7 +260,7 @@ def by_joint(
     for joint in value:
         if joint not in joints:
             raise SettingsError(
-                f"{name} is stated for {joint!r}, which is not a moving joint: "
+                f"{name} is given for {joint!r}, which is not a moving joint: "
                 f"{listed(joints)}{suggestion(joint, joints)}"
             )
     others = zip(joints, np.broadcast_to(other, len(joints)), strict=True)

@@ -528,12 +528,12 @@ class _Gear:
         if np.isinf(self.k).any():
             joint = joints[int(np.argmax(np.isinf(self.k)))]
             raise SettingsError(
-                f"actuator: stiffness is not stated for {joint!r}. State it for every joint"
+                f"actuator: stiffness is not given for {joint!r}. Set it for every joint"
             )
         if np.linalg.eigvalsh(plant.armature)[0] <= 0.0:
             least = joints[int(np.argmin(plant.armature.diagonal()))]
             raise SettingsError(
-                f"the motor of {least!r} has no armature, which an elastic gear needs. State it in "
+                f"the motor of {least!r} has no armature, which an elastic gear needs. Set it in "
                 f'[truth.values], for example "{least}.armature" = 0.1 [kg m^2]'
             )
         self.rotors = np.linalg.inv(plant.armature)
@@ -683,9 +683,8 @@ def perturbed_bodies(model: RobotModel, size: float, rng: np.random.Generator) -
         values, axes = np.linalg.eigh(J)
         if values[0] < -SLACK * max(values[-1], 0.0) or values[-1] < 0:
             raise ModelError(
-                f"body {name!r} of the URDF is physically inconsistent: the smallest eigenvalue of "
-                f"its pseudo-inertia is {values[0]:.3g}, expected 0 or more. Correct its inertial "
-                "(robotid inspect), or state inertials = 0 in [truth]"
+                f"body {name!r} of the URDF: the smallest eigenvalue of its pseudo-inertia is "
+                f"{values[0]:.3g}, expected 0 or more. Correct it, or set inertials = 0 in [truth]"
             )
         root = axes * np.sqrt(np.maximum(values, 0.0)) @ axes.T
         S = np.zeros((4, 4))
@@ -721,9 +720,8 @@ def _check(model: RobotModel, pi: Array) -> None:
         values = np.linalg.eigvalsh(J)
         if values[0] < -SLACK * max(values[-1], 0.0):
             raise SettingsError(
-                f"truth: body {name!r} is physically inconsistent: the smallest eigenvalue of its "
-                f"pseudo-inertia is {values[0]:.3g}, expected 0 or more. State other values, or "
-                "inertials = 0.1 to draw consistent ones"
+                f"truth: body {name!r}: the smallest eigenvalue of its pseudo-inertia is "
+                f"{values[0]:.3g}, expected 0 or more. Set other values, or inertials = 0.1"
             )
     for i in np.flatnonzero(layout.is_nonnegative() & (pi < 0)):
         raise SettingsError(

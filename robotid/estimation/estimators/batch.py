@@ -83,9 +83,8 @@ class WLS(BatchEstimator):
                 return solution.estimate(factors.names, covariance, sigma, iteration, message)
         raise NotConvergedError(
             f"the noise levels of WLS have not converged: relative change {change:.1e} after "
-            f"{_MAX_ITERATIONS} iterations, expected less than {_SETTLED:g}, with "
-            f"{int(factors.rows.sum())} rows for {len(factors.names)} parameters; record more "
-            "data, or check whether a joint has a residual of 0",
+            f"{_MAX_ITERATIONS} iterations, expected less than {_SETTLED:g}; record more data than "
+            f"these {int(factors.rows.sum())} rows, or check whether a joint has a residual of 0",
             "max_iterations",
         )
 

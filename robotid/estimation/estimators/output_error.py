@@ -239,8 +239,8 @@ class OutputError(Estimator[Simulator]):
         damping, cost = _CAUTIOUS, self._cost(simulator, weights, theta, residuals)
         if not np.isfinite(cost):
             raise NotConvergedError(
-                "the simulation of the closed loop with the initial values diverges; state gains "
-                "in [controller] that are closer to those of the drives",
+                "the simulation of the closed loop with the initial values diverges; set gains "
+                "in [controller] that are closer to the drive's",
                 "no start",
             )
         for step in range(1, self.steps + 1):

@@ -137,11 +137,11 @@ class RLS(Filter[RLSState]):
         if not (np.isfinite(self.sigma).all() and (self.sigma > 0).all()):
             raise DataError(f"sigma is {self.sigma}, expected positive finite numbers")
         if self.prior_std is not None and self.prior is None:
-            raise DataError("prior_std was given without prior; state both, or neither")
+            raise DataError("prior_std was given without prior; give both, or neither")
         if self.forgetting < 1 and self.prior_std is None:
             raise DataError(
                 f"forgetting is {self.forgetting}, which needs prior and prior_std, as information "
-                "that no motion updates vanishes; state both"
+                "that no motion updates vanishes; give both"
             )
 
     @property
@@ -386,7 +386,7 @@ class Descent(RecursiveEstimator[DescentState]):
         prx = float(np.linalg.norm(state.prx))
         message = (
             f"{state.steps} steps, {state.skipped} without information, |PRX| = {prx:.3g}; "
-            "a gradient method has no covariance, it is stated as infinite"
+            "a gradient method has no covariance, its errors are infinite"
         )
         return Estimate(
             state.mean / self._unit, np.full((c, c), np.inf), names, np.sqrt(state.squares),

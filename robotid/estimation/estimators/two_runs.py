@@ -82,7 +82,7 @@ class TwoRuns:
             raise NotConvergedError(
                 f"the gains have not converged: relative change {np.abs(step).max():.1e} after "
                 f"{_STEPS} steps, expected less than {_SETTLED:g}; record motions with more "
-                "excitation in both runs, or state some of the gains",
+                "excitation in both runs, or give some of the gains",
                 "max_iterations",
             )
         covariance, freedom = self._errors(gain, at, solution, bread, by_joint)
@@ -212,7 +212,7 @@ class TwoRuns:
         if len(self.unknown) and np.abs(np.diag(R)[:-1]).min() < ROUNDING:
             raise DataError(
                 "an unknown gain is not identifiable: the current of a joint is 0 or constant, or "
-                "it is not coupled to a joint of known gain or to the known mass; state the gain "
+                "it is not coupled to a joint of known gain or to the known mass; set the gain "
                 "of this joint"
             )
         inverse = np.linalg.inv(R[:-1, :-1]) / scale[:, None]

@@ -94,8 +94,8 @@ def _corners(value: Any, name: str) -> tuple[list[float], list[float]]:  # noqa:
     low, high = corners
     if any(a > b for a, b in zip(low, high, strict=True)):
         raise SettingsError(
-            f"com of {name} is {value!r}: a coordinate of the first corner is larger than that of "
-            "the second; write the corner with the smaller coordinates first"
+            f"com of {name} is {value!r}: a coordinate of the first corner is larger than of the "
+            "second corner; write the corner with the smaller coordinates first"
         )
     return low, high
 
@@ -265,7 +265,7 @@ class KalmanSettings(RecursiveSettings):
     name: str = _called("kalman", "a Kalman filter over the samples")
     walk: float = setting(
         0.0,
-        "standard deviation of the parameters' random walk per sample, over that of the prior [-]",
+        "standard deviation of the parameters' random walk per sample, over the prior's [-]",
         within=_NOT_NEGATIVE,
     )
     gate: float | bool = setting(

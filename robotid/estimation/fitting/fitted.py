@@ -229,7 +229,7 @@ class Fit(Identified, Solution):
             if not speeds.any():
                 raise DataError(
                     f"{joint} was at rest in the fitted logs, so the range of speeds is not known; "
-                    "state the speeds: friction(joint, v)"
+                    "give the speeds: friction(joint, v)"
                 )
             side = np.linspace(speeds.min(), speeds.max(), _SPEEDS)
             v = np.append(-side[::-1], side)

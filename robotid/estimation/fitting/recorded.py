@@ -330,7 +330,7 @@ def _check_base(model: RobotModel, log: Log) -> None:
         stated = tuple(x for x in names if x in logged)  # contacts without flags are found
         if logged != (stated if kind == "contacts" else names):
             raise DataError(
-                f"{log.name} has the {kind} {listed(logged)}, expected those of the model, "
+                f"{log.name} has the {kind} {listed(logged)}, expected the model's, "
                 f"{listed(names)}, in this order; pass Log(..., {kind}={{...}})"
             )
 

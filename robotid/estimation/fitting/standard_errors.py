@@ -103,7 +103,7 @@ def with_wls_errors(estimate: Estimate, wls: Estimate) -> Estimate:
     """Return a gradient method's estimate with the errors of WLS plus its distance to it."""
     distance = estimate.theta - wls.theta
     covariance = wls.covariance + np.outer(distance, distance)
-    reason = "standard errors are those of wls plus the distance to it"
+    reason = "standard errors of WLS plus the distance to WLS"
     return replace(
         estimate, covariance=covariance, rank=wls.rank, condition=wls.condition,
         undetermined=wls.undetermined,

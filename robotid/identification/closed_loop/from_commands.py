@@ -443,7 +443,7 @@ def _settled_delay(examined: Finding, result: PositionIdentification) -> Finding
     estimate, free_parameters = result.estimate, result.fit.simulator.free_parameters
     errors = estimate.std_error[[free.what == "delay" for free in free_parameters]].tolist()
     if any(name.endswith("delay") for name in estimate.details["at_bound"]):
-        known = "its standard error is that of the bound, not of the delay"
+        known = "its standard error belongs to the bound, not to the delay"
         remedy = f"{examined.remedy}. The delay of the fit is 0, its lower bound: {known}"
         return examined.reworded(remedy=remedy)
     span = examined.evidence["longest"] - examined.evidence["shortest"]

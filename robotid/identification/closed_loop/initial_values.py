@@ -181,7 +181,7 @@ def _coarse(
     if not np.isfinite(best).all():
         rate = "" if bare.rate is None else f", and another rate than {bare.rate:g} Hz or none,"
         raise NotConvergedError(
-            "no second-order model of the joints that was tried can be simulated. State the "
+            "no second-order model of the joints that was tried can be simulated. Set the "
             f"gains{rate} in [controller]",
             "no start",
         )

@@ -64,7 +64,7 @@ class LoopSettings(Settings):
         reads=Entries(dict, (list,)),
     )  # fmt: skip
     zeros: str = setting(
-        "urdf", "zero and sign of the encoders: 'urdf', those of the URDF; 'find', fitted from "
+        "urdf", "zero and sign of the encoders: 'urdf': as in the URDF; 'find': fitted from "
         "gravity",
         among=("urdf", "find"),
     )  # fmt: skip

@@ -676,7 +676,7 @@ def gain_scale(simulator: LoopSimulator, estimator: OutputError, estimate: Estim
         if any(free.what == what for free in simulator.free_parameters):
             continue  # it is fitted, so that it scales with the other one
         for j, value in enumerate(getattr(simulator.base, what).tolist()):
-            gains.append(FreeParameter(f"{what} of {j} as stated", what, (j,), value, np.inf))
+            gains.append(FreeParameter(f"{what} of {j} as given", what, (j,), value, np.inf))
     wide = replace(simulator, free_parameters=(*simulator.free_parameters, *gains))
     theta = np.concatenate([estimate.theta, [gain.prior for gain in gains]])
     H, g = estimator.normal(wide, estimator.weights(wide, theta), theta, frees=True)

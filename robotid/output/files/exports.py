@@ -34,8 +34,8 @@ from robotid.robot.tree import Joint
 
 _WIDEST = 120  # characters of a YAML table in one line
 _GRAVITY = (
-    "the controller compensates gravity with the URDF's model, which the file cannot state; add "
-    "this torque to that of the actuators (in MuJoCo, gravcomp = 1 of each body is close to it)"
+    "the controller compensates gravity with the URDF's model, which the file lacks; add "
+    "this torque to the actuators' torque (in MuJoCo, gravcomp = 1 of each body is close to it)"
 )
 _RATE = (
     "the controller runs at {rate:g} Hz with a zero-order hold; the actuators run at each step of "
@@ -164,9 +164,7 @@ def unstated_terms(
     ]
     if not has_couplings:
         missing += [f"the loop {loop.name}" for loop in model.loops]
-    sentence = (
-        f"{name} cannot state {listed(missing)}; the drive parameters file of the URDF has them"
-    )
+    sentence = f"{name} lacks {listed(missing)}; the drive parameters file of the URDF has them"
     return [sentence] if missing else []
 
 

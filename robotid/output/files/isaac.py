@@ -46,7 +46,7 @@ def export(result: Result, target: Path, *, step: float = 0.005) -> Written:
     ):
         values = [f"{drive.joint} {x:.4g}" for drive in of.commanded if (x := getattr(drive, key))]
         if values:
-            notes.append(f"Isaac Lab cannot state {words} ({listed(values)}); {remedy}")
+            notes.append(f"Isaac Lab lacks {words} ({listed(values)}); {remedy}")
     head = head_of("isaac", robot=json.dumps(of.model.name), version=__version__, file=target.name)
     write_text(yaml_text(content, "\n".join([head, *notes])), target)
     return of.written(target, notes=notes)

@@ -37,7 +37,7 @@ FORMAT = Format(
     "mjcf",
     "MuJoCo model",
     ".xml",
-    use="Use the result: the identified URDF is written; this command writes a MuJoCo model.",
+    use="Use the result in MuJoCo; the identified URDF is written, too.",
     use_of_gains="Simulate it in MuJoCo, gains and delays included.",
     options={
         "step": Option("time step [s], default 0.001", "S", float),
@@ -107,13 +107,13 @@ class _Servos:
         if delays and self.delay == "filter":
             notes.append(
                 "delays are first-order filters with the delay as time constant; their initial "
-                "value is 0 unless act states it"
+                "value is 0 unless act sets it"
             )
         elif delays:
             notes.append(
                 f"delays are increased by half a step of {self.step:g} s, because the force of a "
                 "step acts half a step early; they need MuJoCo 3.5; commands before the start are "
-                "0 unless mj_initCtrlHistory states them"
+                "0 unless mj_initCtrlHistory sets them"
             )
         short = [name for name in delays if delays[name] < 0.5 * self.step]
         if short and self.delay == "history":

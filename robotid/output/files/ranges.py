@@ -61,7 +61,7 @@ def export(
 ) -> Written:
     """Write the ranges that a result states, as YAML, and samples beside it, as JSON."""
     if samples is None and seed is not None:
-        raise SettingsError("seed is an option of samples; state their number, samples, too")
+        raise SettingsError("seed is an option of samples; set their number, samples, too")
     model, pi = result.identified  # raises for a result without URDF
     has_gains = bool(commanded_drives(model, pi, result.content, result.path.name))
     if "ranges" not in result.content and not has_gains:

@@ -340,8 +340,6 @@ def _check_torque(model: RobotModel, pi: Array, urdf: Path, sidecar: Path) -> No
     difference = np.linalg.norm(found - wanted, axis=0)  # (n_rows,)
     off = np.flatnonzero(difference > TINY * np.linalg.norm(wanted, axis=0))
     if off.size:
-        raise ModelError(
-            f"{urdf.name} is not written: in the test reading, its torque differs from that of the "
-            f"parameters at {listed(model.row_names[i] for i in off)}. If {model.tree.path} has "
-            "changed since the model was read, read the model again"
-        )
+        rows = listed(model.row_names[i] for i in off)
+        words = f"{urdf.name} is not written: read back, it has another torque at {rows}"
+        raise ModelError(f"{words}. If {model.tree.path} has changed, read the model again")

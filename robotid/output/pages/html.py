@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robotid.base.files import write_text
+from robotid.base.findings import listed
 from robotid.base.text import arguments
 from robotid.base.typing import Array
 
@@ -95,6 +96,15 @@ def number(value: float | None, spec: str = ".4g") -> Cell:
     if value is None or not math.isfinite(value):
         return Cell("–", "number")
     return Cell(format(value, spec).replace("-", "−"), "number", float(value))
+
+
+def plain(value: object) -> str:
+    """Return a setting as text."""
+    if isinstance(value, list):
+        return listed(map(plain, value))
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def percent(value: float | None) -> Cell:
@@ -212,7 +222,7 @@ def command_html(block: str) -> str:
     return f'<pre class="command">{html}</pre>'
 
 
-def page(title: str, header: str, sections: Mapping[str, Section | tuple[str, str]]) -> str:
+def page(title: str, header: str, sections: Mapping[str, tuple[Any, ...]]) -> str:
     """Return the HTML of a page: links to its sections, its header, the sections."""
     shown = {key: Section(*section) for key, section in sections.items()}
     links = "".join(f'<a href="#{key}">{x.title}</a> ' for key, x in shown.items())

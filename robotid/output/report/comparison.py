@@ -28,6 +28,7 @@ from robotid.output.pages.html import (
     number,
     page,
     percent,
+    plain,
     text,
     with_error,
 )
@@ -129,8 +130,7 @@ def _require_same_mapping(
                 f"{has} has {len(names)} base parameters that {lacks} does not have: "
                 f"{listed(names, 5)}; {what}"
             )
-    changed = [name for name in ours if ours[name] != theirs[name]]
-    if changed:
+    if changed := [name for name in ours if ours[name] != theirs[name]]:
         name = changed[0]
         raise DataError(
             f"{len(changed)} base parameters have other expressions in {first} and {second}: "
@@ -171,8 +171,7 @@ def _common_recordings(
     common = {k: v for k, v in recordings[0].items() if all(k in other for other in recordings)}
     notes = []
     for k, by_recording in enumerate(recordings):
-        left = [names[v["log"]] for key, v in by_recording.items() if key not in common]
-        if left:
+        if left := [names[v["log"]] for key, v in by_recording.items() if key not in common]:
             notes.append(
                 f"{_label(k)} was validated on {', '.join(left)}, other results were not: these "
                 "errors are not compared"
@@ -247,16 +246,8 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
         if isinstance(value, dict):
             found |= _flat(value, f"{prefix}{key}.")
         else:
-            found[prefix + key] = _plain(value)
+            found[prefix + key] = plain(value)
     return found
-
-
-def _plain(value: object) -> str:
-    if isinstance(value, list):
-        return listed(map(_plain, value))
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _differences(each: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
@@ -327,7 +318,6 @@ def _errors_section(content: Mapping[str, Any]) -> str:
     tables += "" if are_alike else block("comparison.not_alike")
     tables += _error_table("Fitted samples of each result", content, content["fitted"], are_alike)
     notes = "".join(f"<li>{escape(note)}</li>" for note in content["notes"])
-    notes = f"<ul>{notes}</ul>\n" if notes else ""
     units = {entry["unit"] for entry in content["fitted"]}
     share = (TORQUE if units.isdisjoint(("rad", "m")) else POSITION).share
     return block("comparison.errors", notes=notes, tables=tables, share=share)
@@ -426,13 +416,11 @@ _PARAMETERS = (
 
 def fleet_page(content: Mapping[str, Any]) -> str:
     """Return the HTML of the page."""
-    failures, unlike = content["failures"], content["unlike"]
     facts = {
         "Units": f"{content['done']} of {content['units']} identified",
         "Logs": str(content["logs"]),
         "Verdicts": ", ".join(f"{n} {escape(v)}" for v, n in content["verdicts"].items()) or "none",
-        "Failures": str(len(failures)),
-        "Units that differ": str(len({entry["unit"] for entry in unlike})),
+        "Units that differ": str(len({entry["unit"] for entry in content["unlike"]})),
     }
     sections = {
         "units": ("Units", _units(content)),
@@ -453,7 +441,7 @@ def _units(content: Mapping[str, Any]) -> str:
         link = f'<a href="{escape(entry["report"])}">report</a>' if entry["report"] else "–"
         verdict = text(entry["verdict"], flag=entry["verdict"] in _ORDER[:2])
         shown = {"verdict": verdict, "reason": words + entry["reason"]}
-        rows.append(entry | shown | {"report": Cell(link, "text")})
+        rows.append({**entry, **shown, "report": Cell(link, "text")})
     return listing("Units, the worst first", _UNITS, rows, is_data=True)
 
 

@@ -134,10 +134,9 @@ def _over_time(model: RobotModel, content: Mapping[str, Any], course: Course) ->
         if len(free) and kind in ("acceleration", "torque"):
             prismatic = [model.joints[j] in model.layout.prismatic for j in free]
             units = [_UNITS[k]] * (not all(prismatic)) + [_PRISMATIC[k]] * any(prismatic)
-            lines = tuple(_lines(model, course.values[k], free))
-            name = f"{kind} [{' or '.join(units)}]"
-            chart = Chart(f"{kind} of each joint", course.t, lines, "time [s]", name, "time")
-            charts.append(chart_html(chart, f"{kind.capitalize()} without a stated limit"))
+            name, lines = f"{kind} [{' or '.join(units)}]", _lines(model, course.values[k], free)
+            chart = Chart(f"{kind} of each joint", course.t, tuple(lines), "time [s]", name, "time")
+            charts.append(chart_html(chart, f"{kind.capitalize()} without a limit"))
     return f'<div class="plots">\n{"".join(charts)}</div>\n'
 
 

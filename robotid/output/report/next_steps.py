@@ -323,11 +323,7 @@ def _watch(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause])
     rows = found.metrics().per_joint
     where, why = _named(causes, found.model.joints), "a wrong torque channel, a spring, gear ripple"
     if not any(joint in rows for joint in found.model.joints):  # no torques were measured
-        where = "the base"
-        why = (
-            "noise of the motion (lower cutoff), a force that is not measured, a delay between "
-            "motion and forces"
-        )
+        where, why = "the base", "noise of the motion (lower cutoff), an unmeasured force, a delay"
     return _step("watch", origin, _replay(found, origin), joints=where, why=why)
 
 

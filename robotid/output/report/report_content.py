@@ -160,8 +160,8 @@ def _cause(cause: Cause) -> str:
     findings = ""
     if len(cause.findings) > len(cause.messages):
         items = "".join(f"<li>{escape(finding.message)}</li>" for finding in cause.findings)
-        title = f"all {len(cause.findings)} findings"
-        findings = f"<details><summary>{title}</summary><ul>{items}</ul></details>\n"
+        title = f"<summary>all {len(cause.findings)} findings</summary>"
+        findings = f"<details>{title}<ul>{items}</ul></details>\n"
     return block(
         "report.cause",
         severity=cause.severity,
@@ -528,7 +528,9 @@ def _selected_terms(found: TorqueIdentification) -> str:
 
 def why_section(found: TorqueIdentification) -> str:
     """Return the residual analysis: a part for each joint, the worst joint first and open."""
-    torques = sorted(found.joint_torques, key=_relative_residual, reverse=True)
+    torques = sorted(
+        found.joint_torques, key=lambda x: -x.rms["residual"] / (x.rms["measured"] or np.inf)
+    )
     logs = torques[0].rows.recordings
     kind = "Validation logs" if torques[0].fitted is not None else "Fitted logs, without validation"
     names = [e.name for e in found.validation or found.fitted]
@@ -543,12 +545,6 @@ def why_section(found: TorqueIdentification) -> str:
         for k, torque in enumerate(torques)
     )
     return block("report.why", kind=kind, logs=escape(", ".join(logs)), joints=joints)
-
-
-def _relative_residual(torque: JointTorque) -> float:
-    """Return the RMS residual over the RMS torque; -1 if there is no torque."""
-    rms = torque.rms
-    return rms["residual"] / rms["measured"] if rms["measured"] > 0 else -1.0
 
 
 def _joint(torque: JointTorque, link: str) -> str:

@@ -148,8 +148,7 @@ def error_bars(
     """Return the errors of the joints on their worst recordings as bars, the worst joint first."""
     worst = worst_errors(recordings)
     # the only validation recording need not be named
-    is_alone = len(recordings) == 1 and not recordings[0].is_fitted
-    alone = f" on {recordings[0].name}" if is_alone else ""
+    alone = f" on {recordings[0].name}" * (len(recordings) == 1 and not recordings[0].is_fitted)
     items, said = list[str](), set[str]()
     for joint in [*worst, *(joint for joint in verdicts if joint not in worst)]:
         verdict, row, link, picture = verdicts.get(joint, _UNKNOWN), rows.index(joint), "", ""
@@ -372,8 +371,8 @@ def both(value: float, error: float) -> Cell:
 
 def sources_fact(entries: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     """Return the number of parameters by source, HTML by its name."""
-    counts = {kind: sum(entry["source"] == kind for entry in entries) for kind in SOURCE_NAMES}
-    known = {kind: count for kind, count in counts.items() if count}
+    sources = [entry["source"] for entry in entries]
+    known = {kind: sources.count(kind) for kind in SOURCE_NAMES if kind in sources}
     shares = "".join(f'<i class="from-{k}" style="flex: {n}"></i>' for k, n in known.items())
     words = ", ".join(f"{count} {SOURCE_NAMES[kind]}" for kind, count in known.items())
     name = f"{len(entries)} parameters, determined by"

@@ -55,10 +55,8 @@ def robot_scene(model: RobotModel) -> Scene:
     """Return nodes and parts: visual shapes of the links, or capsules and drums without any."""
     tree = model.pin_model
     parts, meshes, boxes, missing = _visuals(model)
-    notes: tuple[str, ...] = ()
-    if missing:
-        words = "meshes were not found or are not readable, for example"
-        notes = (f"{len(missing)} {words} {missing[0]}",)
+    words = "meshes were not found or are not readable, for example"
+    notes = (f"{len(missing)} {words} {missing[0]}",) if missing else ()
     for i in sorted({*range(tree.njoints)} - {part["node"] for part in parts}):
         parts += _skeleton(model, i)
     content = {

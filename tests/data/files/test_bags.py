@@ -67,7 +67,7 @@ def test_the_topic_must_be_stated_if_several_would_do(tmp_path):
         f"topics: {{'/arm': '{STATE}', '/chatter': 'std_msgs/msg/String', '/ghost': '{STATE}'}}"
     )
     with refused(
-        f'bag has 2 topics of {STATE}: /arm, /ghost; {listing}. State one: topic = "/arm" {HOW}'
+        f'bag has 2 topics of {STATE}: /arm, /ghost; {listing}. Set one: topic = "/arm" {HOW}'
     ):
         read_log(path, JOINTS)
     assert_same(read_log(path, JOINTS, source=LogSource(topic="/arm")), log)
@@ -410,7 +410,7 @@ def test_one_of_several_topics_is_stated(tmp_path):
     with pytest.raises(
         DataError,
         match=re.escape(
-            "log has 2 topics with base_x: /mocap/odom, /odom. State all topics of sensors to "
+            "log has 2 topics with base_x: /mocap/odom, /odom. Set all topics of sensors to "
             'read: sensors = ["/mocap/odom"]'
         ),
     ):
@@ -421,8 +421,8 @@ def test_one_of_several_topics_is_stated(tmp_path):
         log = read_log(path, LEG, base=BASE, source=source)
         np.testing.assert_allclose(log.base.pose[:, 0], log.t + shift, atol=1e-9)
     for topic, message in (
-        ("/odo", "no message of a topic '/odo', which sensors states"),
-        ("/joint_states", "topic '/joint_states', which sensors states, has messages of sensor_"),
+        ("/odo", "no message of a topic '/odo', given in sensors"),
+        ("/joint_states", "topic '/joint_states', given in sensors, has messages of sensor_"),
     ):
         with pytest.raises(DataError, match=message):
             read_log(path, LEG, source=LogSource(sensors=(topic,)))

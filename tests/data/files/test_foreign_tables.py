@@ -254,7 +254,7 @@ def test_names_that_do_not_fit_and_a_rate_that_is_not_needed_are_told(tmp_path):
     names = ("q_shoulder", "q_elbow", "tau_shoulder", "tau_elbow")
     back = read_log(tmp_path / "run.npz", JOINTS, source=LogSource(names=names, rate=50.0))
     np.testing.assert_array_equal(back.tau, LOG.tau)
-    with refused("run.npz has 4 columns, but log.names states 3; name each column, in their order"):
+    with refused("run.npz has 4 columns, but log.names has 3; name each column, in their order"):
         read_log(tmp_path / "run.npz", JOINTS, source=LogSource(names=names[:3], rate=50.0))
     timed = read_log(pd.DataFrame(juggled("/arm")), JOINTS, source=LogSource(rate=7.0))
     np.testing.assert_array_equal(timed.t, LOG.t)

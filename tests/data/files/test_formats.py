@@ -306,7 +306,7 @@ CSV_FAULTS = [
     (HEADER, "has a header but no rows; record at least 2"),
     (HEADER + "\n", "has a header but no rows; record at least 2"),
     (HEADER + "0,1,2\n", "has 1 rows, expected at least 2; record longer"),
-    (ROWS, "has no header. State the names of its 3 columns in the job file, and the rate of its "
+    (ROWS, "has no header. Set the names of its 3 columns in the job file, and the rate of its "
      'rows if none of them is the time. An example:\n[log]\nnames = ["time", "q_1", "tau_1"]'),
     ("time,q_a,q_a,tau_a\n0,1,2,3\n1,1,2,3\n", "has more than one column q_a; rename or remove"),
     (HEADER + ROWS + "0.2,1.", ": line 4 has 2 cells, the header has 3; correct it"),
@@ -412,7 +412,7 @@ def test_groups_are_chosen_like_topics(tmp_path):
     with pytest.raises(DataError) as caught:
         read_log(path, JOINTS)
     assert str(caught.value).startswith("run.h5 has 2 groups with a time: left, right; ")
-    assert str(caught.value).endswith(f'. State one: topic = "left" {HOW}')
+    assert str(caught.value).endswith(f'. Set one: topic = "left" {HOW}')
     assert_same(read_log(path, JOINTS, source=LogSource(topic="/left/")), log)
     with refused("run.h5 has no group 'lefd'; groups found: left, right. Did you mean 'left'?"):
         read_log(path, JOINTS, source=LogSource(topic="lefd"))

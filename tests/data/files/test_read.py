@@ -161,11 +161,11 @@ def test_a_table_to_paste_is_proposed_and_read():
 #: Changes of the table, arguments, and the fragments of the error in their order.
 REFUSED = {
     "two names": (dict(position_elbow=ONE), {}, "has 'q_elbow' and 'position_elbow', two names of "
-                  'the same quantity; remove one, or state in the job file columns = { q_elbow ='),
+                  'the same quantity; remove one, or set in the job file columns = { q_elbow ='),
     "two clocks": (dict(t=T), {}, "has 'time' and 't', two names of the same quantity"),
     "moving joint without torque": (
         dict(tau_elbow=None), {}, "log has no column 'tau_elbow'; torque or current columns found: "
-        "tau_shoulder. If elbow, which moves in the log, has no drive, state passive ="),
+        "tau_shoulder. If elbow, which moves in the log, has no drive, set passive ="),
     "resting joint without torque": (
         dict(tau_elbow=None, q_elbow=ONE), {}, "If elbow was at rest, lock it at its position, as "
         "--lock elbow=0, or locked = { elbow = 0 } in the job file$"),
@@ -174,7 +174,7 @@ REFUSED = {
     "no torques": (NO_TAU, {}, "torque or current columns found: none. Record tau_<joint> or "
                    "current_<joint>. Commanded positions, qref_<joint>, are enough for"),
     "other columns": (NO_TAU | dict(M1=ONE), {}, 'Other columns: M1. ', "Rename the columns, or "
-                      'state them in the job file:\n[columns]\ntime = "time"\nq_shoulder = "q_sh',
+                      'set them in the job file:\n[columns]\ntime = "time"\nq_shoulder = "q_sh',
                       '# tau_elbow = "NAME"$'),
     "misspelt": (dict(q_elbow=None, q_elbow2=ONE), {}, '\nq_elbow = "q_elbow2"  # by order$'),
     "no time": (dict(time=None, Clock=T), {}, "log has no column 'time'; columns found: q_shoulder"
@@ -182,7 +182,7 @@ REFUSED = {
     "no standard name": ({}, dict(columns={"tau_elbw": "tau_elbow"}), "columns: 'tau_elbw' is not a"
                          " standard name of a column, as 'time' or 'tau_shoulder'. Did you mean"),
     "no such column": ({}, dict(columns={"tau_elbow": "tau_elbo"}), "log has no column 'tau_elbo', "
-                       "which is stated for 'tau_elbow' in columns", "Did you mean 'tau_elbow'?"),
+                       "which is given for 'tau_elbow' in columns", "Did you mean 'tau_elbow'?"),
     "read twice": ({}, dict(columns={"tau_shoulder": "tau_elbow", "tau_elbow": "tau_elbow"}),
                    "tau_elbow are read twice; correct columns in the job file"),
     "two joints, one name": ({}, dict(source=LogSource(joints={"shoulder": "elbow"})),
@@ -194,7 +194,7 @@ REFUSED = {
     "gain 0": ({}, dict(gains={"elbow": 0.0}), "gain of 'elbow' is 0.0, expected a number other"),
     "gain NaN": ({}, dict(gains={"elbow": np.nan}), "gain of 'elbow' is nan, expected a number"),
     "no gain": (dict(tau_elbow=None, i_elbow=ONE), {}, "joint 'elbow' has the current 'i_elbow' but"
-                " no gain; state it in N m/A: --gain elbow=..., or in the job file [torque] gains",
+                " no gain; set it in N m/A: --gain elbow=..., or in the job file [torque] gains",
                 "robotid payload URDF LOADED --reference BARE --mass KG --gains$"),
     "no gains, no torque": (
         dict(tau_elbow=None, tau_shoulder=None, i_elbow=ONE), {}, "--gain elbow=..., or", "No "
@@ -215,7 +215,7 @@ REFUSED = {
                       "by --estimator simulation --kp N_M_PER_RAD", "kp = N_M_PER_RAD  # position"),
     "sizes of loads": (NO_TAU | of("loadsize", LOG.q), {}, "none. Loads without sign, which are no "
                        "torques: loadsize_sh"),
-    "motors": (NO_TAU | dict(taum_a=ONE), {}, "For columns of motors, as taum_a, state [[transmis"),
+    "motors": (NO_TAU | dict(taum_a=ONE), {}, "For columns of motors, as taum_a, add [[transmis"),
 }  # fmt: skip
 
 

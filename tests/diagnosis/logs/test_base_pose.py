@@ -85,7 +85,7 @@ def test_another_vertical_axis_of_the_world_is_named(robot, log, axis, down):
     (found,) = check_base(robot, other, SLOW)
     assert (found.code, found.severity) == ("base_orientation", "error")
     assert f"above them along {axis} of the world" in found.message
-    assert f"state gravity = [0, {down}, 0] at the top" in found.message
+    assert f"set gravity = [0, {down}, 0] at the top" in found.message
     assert abs(found.evidence["height"]) < 0.2
     assert found.evidence["best"] > 0.9
     (found,) = check_base(robot, with_quaternion(other, QUATERNIONS[0][0]), SLOW)

@@ -385,7 +385,7 @@ def test_rows_that_are_stamped_on_arrival_are_named_with_their_remedy():
         "rows": late, "share": pytest.approx(late / 899), "longest": pytest.approx(0.0595)
     }  # fmt: skip
     assert "the mean step is 10 ms, the typical one 10 ms, so no rows" in found.message
-    assert 'so no rows are missing: state stamp = "even" in [log]' in found.message
+    assert 'so no rows are missing: set stamp = "even" in [log]' in found.message
     missing = said(check_clock(clocked_log(bunched(lost=90))))["bunched_stamps"]
     assert missing.message.endswith("are wrong; log the time of recording")
 

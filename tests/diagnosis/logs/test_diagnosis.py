@@ -111,6 +111,16 @@ def test_each_corruption_is_found_by_its_own_code(name, spoilt):
     json.dumps(findings_to_dict(findings), allow_nan=False)
 
 
+@pytest.mark.parametrize(
+    ("name", "seed"), [("torques without their sign", 0), ("torque delayed by 30 ms", 3)]
+)
+def test_a_fault_of_all_torques_that_hardly_shows_in_one_is_found(name, seed, tmp_path):
+    table, path = table_of(clean_log(robot("ur5"), seed)), tmp_path / "run.csv"
+    write_columns(CASES[name].change(table), path)
+    job = Job(urdf=example_urdf("ur5_robot.urdf"), identification=(LogEntry(path),))
+    assert loud(examine(job)) == set(CASES[name].codes)
+
+
 def test_where_names_the_joint_and_the_evidence_says_how_much(spoilt):
     _, findings = spoilt("one torque negated")
     (found,) = [f for f in findings if f.code == "torque_sign"]

@@ -108,7 +108,7 @@ def hint(position, name="gripper", **units):
 def test_a_gripper_that_may_be_logged_in_percent_has_the_setting_and_the_position_named():
     words = hint(np.deg2rad(35.0), angle="deg")
     assert words.startswith(". If 35, the number in the log, is a percentage, as of LeRobot's gri")
-    assert "state percent = { gripper = [-0.1745, 1.745] } in [units]" in words
+    assert "set percent = { gripper = [-0.1745, 1.745] } in [units]" in words
     assert words.endswith(f"it then is at {-0.174533 + 0.35 * (1.74533 + 0.174533):.4g} rad")
     assert hint(35.0).startswith(". If 35, the number in the log"), "in radians it is far"
     for position, others in (

@@ -253,7 +253,7 @@ def test_noise_of_any_colour_follows_nothing():
         shares.append([d.share for d in found.follows])
     assert log_errors <= 1, f"{log_errors} of {tried}"
     assert (np.mean(shares, axis=0) < 0).all(), "what was fitted to noise predicts no other noise"
-    assert "90 % of its power is broadband (above the cut-off): noise" in found.sentence
+    assert "is noise (90 % of its power is above the cut-off)" in found.sentence
 
 
 def test_too_short_a_recording_says_so(rng):

@@ -73,7 +73,7 @@ def test_torques_of_another_gain_are_told_from_other_masses_and_never_good(four)
     assert found.scale_check.has_one_factor
     assert found.verdict.status == "usable"
     (reason,) = [r for r in found.verdict.reasons if "absolute scale not verified" in r]
-    assert "The same factor 0.80 fits all joints: probable cause: the gains" in reason
+    assert "The same factor 0.80 fits all joints: check the gains" in reason
 
 
 def test_a_load_in_the_hand_is_no_other_scale(four):
@@ -247,7 +247,7 @@ def test_it_decides_before_the_urdf_and_a_contradiction_before_all():
     assert both.contradicts
     assert not both.agrees
     first, second = both.message.split(". Absolute scale ")
-    assert first.startswith("absolute scale contradicted by a stated mass")
+    assert first.startswith("absolute scale contradicted by a given mass")
     assert second.startswith("verified by a payload of known mass")
     assert PayloadCheck.from_dict(both.to_dict()["payloads"][0]) == SHARP
 
@@ -290,7 +290,7 @@ def test_any_total_mass_of_a_fixed_arm_fits_and_none_verifies(lifted, times):
     assert found.contradicts is found.has_one_factor
     assert model.layout.bodies[0] in found.stated.absorbed_by
     assert [x.to_dict()["is_stated"] for x in (free, found)] == [False, True]
-    assert "The stated total_mass does not verify the scale: torque does not" in found.message
+    assert "The given total_mass does not verify the scale: torque does not" in found.message
     assert "Verify it with a payload of known mass (robotid payload)" in found.message
 
 
@@ -326,9 +326,9 @@ def test_the_force_of_a_rail_verifies_a_total_mass_and_contradicts_a_wrong_one(c
     assert wrong.stated.half_width == pytest.approx(right.stated.half_width / 2)
     assert (right.agrees, right.contradicts) == (True, False)
     assert (wrong.agrees, wrong.contradicts) == (False, True)
-    assert right.message.startswith("absolute scale verified by a stated mass")
-    assert "torque alone determines 0.499 +- 0.0022 x the stated total_mass" in wrong.message
-    assert "probable cause: the gains of the torques, or the stated mass" in wrong.message
+    assert right.message.startswith("absolute scale verified by a given mass")
+    assert "torque alone determines 0.499 +- 0.0022 x the given total_mass" in wrong.message
+    assert "check the gains of the torques, and the given mass" in wrong.message
 
 
 def test_stated_masses_of_all_links_add_up_to_one_that_torque_determines(crane):

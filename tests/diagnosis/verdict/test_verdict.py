@@ -70,7 +70,7 @@ def verdict(validation, fitted=None, **open):
         ({"a": joint(20.0), "b": joint(40.0, constant=False)}, None, "poor",
          "b: worse than a constant torque on val.csv: error 40.0 %; a constant would give 33.3 %"),
         ({"a": joint(None, constant=False)}, None, "poor",
-         "a: the torque is 0 throughout val.csv: not evaluated. If the joint has no drive, state "
+         "a: the torque is 0 throughout val.csv: not evaluated. If the joint has no drive, set "
          'passive = ["a"] in the job file'),
         ({"a": joint(4.0, urdf=4.0)}, None, "good", "at most 4.0 % at every joint"),
         ({"a": joint(4.1, urdf=4.0)}, None, "poor", "4.1 % on val.csv, worse than the URDF's 4.0"),
@@ -282,7 +282,7 @@ def test_drive_parameters_that_the_prior_determines_are_named_and_change_no_verd
     for undetermined in ((), ("a.m",)):
         more = Determined(undetermined, is_poorly_excited=False, uncertain_drives=["a.coulomb"])
         assert more.warnings() == []
-        assert "a.coulomb: the standard error is as large as that of the prior" in more.notes()[-1]
+        assert "a.coulomb: the standard error is as large as the prior's" in more.notes()[-1]
         plain = Determined(undetermined, is_poorly_excited=False).notes()
         assert more.notes()[:-1] == plain
 
@@ -293,7 +293,7 @@ def test_errors_of_the_wrench_on_the_base_are_noted_beside_those_of_joints():
     metrics = {name: Metrics(own, 1.0) for name, own in logs.items()}
     (note,) = Predictions(Metrics({"a": joint(4.0)}, 1.0), metrics).of_base()
     assert note.startswith("wrench on the base that contact forces cannot cause, error on both: ")
-    assert "fz 12 %, mx 30 %. The verdict is on the torque of the joints" in note
+    assert "fz 12 %, mx 30 %. The verdict is on the joint torques" in note
 
 
 def test_joints_better_by_the_urdf_are_those_of_all_logs():
@@ -435,7 +435,7 @@ def test_the_worst_joint_decides_by_the_thresholds():
     assert good.status == "good"
     assert good.reasons == (
         "simulated position error on validation logs: at most 5 % of each joint's RMS motion, "
-        "smaller than those of simpler models",
+        "smaller than with simpler models",
     )
     usable = judged_positions({"a": 5.1, "b": 2.0})
     assert (usable.status, statuses(usable)) == ("usable", {"a": "usable", "b": "good"})
@@ -458,7 +458,7 @@ def test_a_plainer_model_that_is_better_keeps_it_from_being_good_and_the_command
     driven = judged_positions({"a": (2.0, {"urdf": 1.0, "rows": 3.0, "steady": 40.0}), "b": 1.0})
     assert "smaller with the URDF with fitted drives" in driven.reasons[0]
     stated = judged_positions({"a": (2.0, {"urdf": 1.0, "command": 40.0}), "b": 1.0})
-    assert "smaller with the URDF with the stated gains" in stated.reasons[0]
+    assert "smaller with the URDF with the given gains" in stated.reasons[0]
 
 
 def test_what_no_log_tests_is_not_evaluated():

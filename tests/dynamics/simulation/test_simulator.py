@@ -116,12 +116,12 @@ def test_a_torque_that_lags_is_late_in_the_log_of_its_joint(ur5, rng):
 def test_an_elastic_gear_needs_a_rotor_and_stiffness_for_every_joint(ur5):
     soft = Actuator(stiffness={"elbow_joint": 1e4})
     for actuator, words in (
-        (soft, "stiffness is not stated for 'shoulder_pan_joint'. State it for every joint"),
+        (soft, "stiffness is not given for 'shoulder_pan_joint'. Set it for every joint"),
         (Actuator(stiffness=1e4), "has no armature, which an elastic gear needs"),
     ):
         with pytest.raises(SettingsError, match=words):
             followed(ur5, ur5.standard_parameters(), Simulation(actuator=actuator))
-    with pytest.raises(SettingsError, match=r"backlash applies only to elastic gears. State their"):
+    with pytest.raises(SettingsError, match=r"backlash applies only to elastic gears. Set their"):
         Actuator(backlash=0.01)
     with pytest.raises(SettingsError, match="perfect, which has no limits and no elastic gears"):
         Simulation(controller=Controller("perfect"), actuator=Actuator(effort=1.0))
@@ -238,7 +238,7 @@ def test_samples_are_lost_at_random(run):
 
 def test_settings_that_cannot_be_are_named(run):
     with pytest.raises(SettingsError, match=re.escape(
-        "sensors: noise.q is stated for 'c', which is not a moving joint: a, b"
+        "sensors: noise.q is given for 'c', which is not a moving joint: a, b"
     )):  # fmt: skip
         of(run, noise=Noise(q={"c": 1.0}))
     with pytest.raises(SettingsError, match=r"sensors.noise: q is -1.0, expected 0 to 1e12"):

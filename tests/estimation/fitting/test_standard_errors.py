@@ -161,7 +161,7 @@ def test_a_gradient_method_ends_beside_the_minimum_and_says_so(W):
     found = with_wls_errors(rough, wls)
     np.testing.assert_allclose(found.covariance, wls.covariance + np.outer(away, away))
     np.testing.assert_array_equal(found.theta, rough.theta)
-    assert "plus the distance to it" in found.message
+    assert "plus the distance to WLS" in found.message
 
 
 def test_the_prior_makes_the_sandwich_of_its_formula(W):

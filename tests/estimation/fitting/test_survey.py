@@ -281,7 +281,7 @@ def test_other_drive_terms_keep_the_rows_and_torques_without_contact_forces(rng)
     other = held.with_model(held.model.with_terms({"FL_KFE": (Cubic(),)})).whole
     np.testing.assert_array_equal(other.mask, held.whole.mask)
     turned = replace(log, contacts=dict(reversed(flags.items())))
-    with pytest.raises(DataError, match="has the contacts FL_FOOT, HR_FOOT, expected those of the"):
+    with pytest.raises(DataError, match="has the contacts FL_FOOT, HR_FOOT, expected the model's"):
         hold_log(model, turned, settings)
     with pytest.raises(DataError, match="log has no pose of the floating base"):
         hold_log(model, replace(log, base=None), settings)

@@ -334,7 +334,7 @@ def test_a_gain_that_varies_between_logs_has_no_range_below_zero(tmp_path):
 @pytest.mark.parametrize(("flags", "words"), [
     (["--samples", "0"], "samples is 0, expected a whole number from 1 to 1000000"),
     (["--samples", "5", "--seed", "-1"], "seed is -1, expected a whole number, 0 or more"),
-    (["--seed", "5"], "seed is an option of samples; state their number, samples, too"),
+    (["--seed", "5"], "seed is an option of samples; set their number, samples, too"),
 ])  # fmt: skip
 def test_bad_options_are_named(folder, tmp_path, flags, words, capsys):
     target = tmp_path / "ranges.yaml"

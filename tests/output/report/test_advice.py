@@ -266,7 +266,7 @@ def test_a_usable_result_of_commands_is_exported(crane):
     driven = judged(replace(crane, loop=LoopSettings(kind="torque")), "usable")
     replay, export = next_steps(driven, JOB)
     assert replay.words == "Compare measured and predicted torque in the replay."
-    assert export.words.startswith("Use the result: the identified URDF is written")
+    assert export.words.startswith("Use the result in MuJoCo")
 
 
 def test_a_poor_result_of_commands_is_corrected_and_not_used(crane):
