@@ -74,12 +74,6 @@ def three(ur5):
 
 
 @pytest.fixture(scope="module")
-def four(ur5):
-    """With the first wrist joint."""
-    return RobotModel.from_urdf(ur5.tree, joints=ur5.joints[:4])
-
-
-@pytest.fixture(scope="module")
 def clean(three):
     """The robot of seed 1 whose drives have nothing beside their model."""
     return identified(three, 1)
