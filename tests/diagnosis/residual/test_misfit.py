@@ -128,10 +128,6 @@ def test_a_coupling_of_some_share_needs_that_of_the_other_joint(monkeypatch):
     assert find_misfits(SimpleNamespace(joints=rows)) == tuple(terms[k] for k in (0, 1, 3, 4))
 
 
-def test_nothing_is_named_where_nothing_is_missing(clean):
-    assert misfits(clean) == ()
-
-
 @pytest.mark.parametrize(
     ("effect", "joint", "size", "unit"),
     [("load", 1, 0.1, "N m per N m"), ("spring", 2, None, "N m/rad")],

@@ -94,7 +94,7 @@ def test_a_moving_link_without_inertial_is_named(tmp_path):
     (finding,) = found(massless, "missing_inertial")
     assert (finding["link"], finding["severity"]) == ("lower", "warning")
     assert (
-        "the URDF has no <inertial> with a mass: lower. Assumed: the masses of"
+        "the URDF has no <inertial> with a mass: lower. robotid assumes the masses of"
         in (finding["message"])
     )
     # a box of 0.2 of the robot's length, 0.5 m, with the density of the other body
@@ -310,10 +310,6 @@ def audit(tmp_path, **changed):
     path = tmp_path / "arm.urdf"
     path.write_text(ARM.format(**(GOOD | changed)))
     return list(audit_links(RobotModel.from_urdf(path)))
-
-
-def test_inertials_that_fit_their_geometry_are_not_mentioned(tmp_path):
-    assert audit(tmp_path) == []
 
 
 @pytest.mark.parametrize(
