@@ -14,7 +14,7 @@ gc.disable()  # until the tests begin: nothing that is imported is garbage
 import numpy as np
 import pytest
 from helpers.browsing import launch
-from helpers.paths import IN_CI, ROOT
+from helpers.paths import IN_CI, ROOT, URDF
 from helpers.synthetic import exact_log, truth
 from numba.core.event import Listener, register
 
@@ -96,6 +96,17 @@ def rng():
 @pytest.fixture(scope="session")
 def ur5():
     return RobotModel.from_urdf(example_urdf("ur5_robot.urdf"))
+
+
+@pytest.fixture(scope="session")
+def four(ur5):
+    """The first four joints of a UR5."""
+    return RobotModel.from_urdf(ur5.tree, joints=ur5.joints[:4])
+
+
+@pytest.fixture(scope="session")
+def planar():
+    return RobotModel.from_urdf(URDF / "planar_2r.urdf")
 
 
 @pytest.fixture(scope="session")

@@ -187,9 +187,7 @@ def test_findings_of_one_code_are_one_cause_and_say_what_they_share_once():
     assert (rest.code, rest.severity) == ("static_joint", "error")
     assert rest.joints == ("arm_1", "arm_7")  # in the order of the robot
     assert rest.findings == (findings[2], findings[0], findings[1])
-    assert rest.messages[0].startswith(
-        "a.csv, b.csv: the log has no motion of arm_7, arm_1 (range 0.0001"
-    )
+    assert rest.messages[0].startswith("a.csv, b.csv: arm_7, arm_1 did not move (range 0.0001")
     assert len(rest.messages) == 1
     assert bent.messages == ("arm_1: bent in 2 places", "arm_1: bent throughout")
     assert (bent.severity, bent.joints) == ("warning", ("arm_1",))
@@ -205,16 +203,12 @@ def test_logs_with_other_joints_are_named_one_by_one():
     findings = [still(log, *pair) for log, of_log in sizes.items() for pair in of_log.items()]
     (cause,) = grouped(findings, joints)
     first, second = cause.messages
-    assert first.startswith(
-        "a.csv, c.csv: the log has no motion of j2, j3 (range 0.0001 to 0.0004 rad)"
-    )
-    assert second.startswith("b.csv: the log has no motion of j1, j3 (range 0.0002 to 0.0005 rad)")
+    assert first.startswith("a.csv, c.csv: j2, j3 did not move (range 0.0001 to 0.0004 rad)")
+    assert second.startswith("b.csv: j1, j3 did not move (range 0.0002 to 0.0005 rad)")
     everywhere = [still("d.csv", joint, 6e-4) for joint in joints]  # true of d.csv
     (cause,) = grouped([*findings, *everywhere], joints)
     (message,) = cause.messages
-    assert message.startswith(
-        "a.csv, b.csv, c.csv, d.csv: the log has no motion of j2, j3, j1 (range"
-    )
+    assert message.startswith("a.csv, b.csv, c.csv, d.csv: j2, j3, j1 did not move (range 0.0001")
 
 
 def late(log, seconds):

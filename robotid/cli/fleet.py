@@ -316,7 +316,8 @@ class _Gathered:
                 self._values[key].append((row["unit"], row["value"], row["std_error"]))
         judged = next((row for row in rows if row.get("verdict")), {})
         verdict, texts = judged.get("verdict", "failed"), [row.get("error") for row in rows]
-        reason = "; ".join(filter(None, [*texts, judged.get("reasons")]))
+        first = judged.get("reasons", "").partition("; ")[0]  # the report has all
+        reason = "; ".join(filter(None, [*texts, first]))
         unit = {"unit": rows[0]["unit"], "verdict": verdict, "reason": reason, "report": report}
         self._units.append(unit)
         self._verdicts.update([verdict] * bool(judged))

@@ -36,7 +36,7 @@ def test_the_error_of_a_robot_at_rest_carries_what_the_doctor_found(arm, rng, tm
     with pytest.raises(DataError, match="0 torque rows") as caught:
         run_job(job, tmp_path / "out")
     notes = caught.value.__notes__
-    assert any("static_joint" in note and "motion of joint_2 (range 0" in note for note in notes)
+    assert any("static_joint" in note and "joint_2 did not move (range 0" in note for note in notes)
     out = ["--out", str(tmp_path / "out")]
     assert main(["identify", arm.tree.path, str(tmp_path / "rest.csv"), *out]) == 1
     lines = capsys.readouterr().err.splitlines()

@@ -18,8 +18,6 @@ from robotid.data.log import (
     blocks_of,
     map_stamps,
     median_step,
-    require_finite,
-    require_increasing,
 )
 
 JOINTS = ("shoulder", "elbow")
@@ -192,19 +190,6 @@ def test_time_stamps_of_no_clock_are_refused(scale):
         caught.value
     )
     assert caught.value.code == "time_unit"
-
-
-def test_rows_are_numbered_as_in_the_file(rng):
-    """Of a block whose first row is row 70."""
-    t = 5.0 + np.arange(4) / 10
-    values = rng.standard_normal((4, 2))
-    values[2, 1] = np.inf
-    with pytest.raises(DataError, match=r"x: q_b is inf at row 72 \(t = 5\.2 s\); remove"):
-        require_finite(values, t, ["q_a", "q_b"], "x", 70)
-    with pytest.raises(DataError, match=r"but t\[73\] = 5\.100 s follows t\[72\] = 5\.200 s"):
-        require_increasing(np.array([5.0, 5.1, 5.2, 5.1]), "x", 70)
-    with pytest.raises(DataError, match=r"t\[71\] = 5\.000 s is a duplicate .* as t\[70\]"):
-        require_increasing(np.array([5.0, 5.0, 5.2]), "x", 70)
 
 
 def test_time_stamps_are_checked_where_blocks_meet():

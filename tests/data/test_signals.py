@@ -43,16 +43,6 @@ def sine_log(t, frequency=0.5, lag=0.0, **options):
     return Log(t=t, q=q, tau=tau, joints=("a", "b"), v=v, **options)
 
 
-def test_switched_off_the_rows_stay_as_they_were():
-    log = sine_log(np.arange(0, 5, 0.01))
-    out = process(log, SignalSettings(cutoff=None, trim=0.0, velocity="measured"))
-    np.testing.assert_array_equal(out.t, log.t)
-    np.testing.assert_array_equal(out.q, log.q)
-    np.testing.assert_array_equal(out.v, log.v)
-    np.testing.assert_array_equal(out.tau, log.tau)
-    assert out.rate is None
-
-
 def test_derivatives_of_a_jittered_sine_are_right():
     rng = np.random.default_rng(0)
     t = np.arange(0, 10, 0.005)
@@ -63,21 +53,6 @@ def test_derivatives_of_a_jittered_sine_are_right():
     np.testing.assert_allclose(np.diff(out.t), 0.005, rtol=1e-9)
     np.testing.assert_allclose(out.v[:, 0], w * np.cos(w * out.t), atol=2e-3)
     np.testing.assert_allclose(out.a[:, 0], -(w**2) * np.sin(w * out.t), atol=2e-2)
-
-
-def test_noise_above_the_cutoff_is_removed():
-    rng = np.random.default_rng(0)
-    clean = sine_log(np.arange(0, 20, 0.002))
-    noisy = Log(
-        t=clean.t,
-        q=clean.q,
-        tau=clean.tau + 0.1 * rng.standard_normal(clean.tau.shape),
-        joints=clean.joints,
-    )
-    out = process(noisy, SignalSettings(cutoff=5.0))
-    residual = out.tau[:, 0] - np.cos(np.pi * out.t)
-    # the share of white noise in the band: 0.1 sqrt(5 / 250)
-    assert 0.5 < residual.std() / (0.1 * np.sqrt(5 / 250)) < 1.5
 
 
 def test_a_lower_rate_is_reached_after_the_filter():
@@ -103,12 +78,6 @@ def test_nothing_crosses_a_gap():
     first = out.segment == 0
     np.testing.assert_allclose(out.tau[first, 0], np.cos(np.pi * out.t[first]), atol=2e-3)
     np.testing.assert_allclose(out.v[:, 0], np.pi * np.cos(np.pi * out.t), atol=1e-2)
-
-
-@pytest.mark.parametrize(("lag", "choice"), [(0.006, "measured"), (0.16, "differentiated")])
-def test_auto_takes_the_measured_velocity_unless_it_is_late(lag, choice):
-    log = sine_log(np.arange(0, 10, 0.01), lag=lag)
-    assert resolve(log, SignalSettings()).velocity == choice
 
 
 @pytest.mark.parametrize(("velocity", "lag"), [("differentiated", 0.0), ("auto", 0.05)])

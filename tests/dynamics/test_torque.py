@@ -1,9 +1,9 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.robots import motion
 
 from robotid.base.exceptions import DataError
-from robotid.data.log import Trajectory
 from robotid.data.signal_settings import Transmission
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import Sample, shuffled
@@ -22,13 +22,8 @@ ROBOTS = ["ur5_robot.urdf", "double_pendulum_continuous.urdf", "kinova.urdf", "t
 
 
 def states(model, rng, samples=5):
-    n = len(model.joints)
-    q = rng.uniform(-3, 3, (samples, n))
-    v, a = rng.uniform(-2, 2, (2, samples, model.n_rows))
-    if model.free_flyer:
-        pose = np.array([pin.SE3ToXYZQUAT(pin.SE3.Random()) for _ in range(samples)])
-        q = np.hstack([pose, q])
-    return q, v, a
+    m = motion(model, rng, samples)
+    return m.q, m.v, m.a
 
 
 @pytest.mark.parametrize(
@@ -102,49 +97,25 @@ def test_support_is_where_the_regressor_can_be_non_zero(free_flyer, rng):
     assert model.support.sum() < 2 * seen.sum()
 
 
-def trajectory(model, rng, samples=1200):
-    q, v, a = states(model, rng, samples)
-    t = np.arange(samples) / 100
-    segment = np.zeros(samples, dtype=int)
-    tau = rng.standard_normal(v.shape)
-    return Trajectory(t=t, q=q, v=v, a=a, tau=tau, joints=model.joints, rate=100.0, segment=segment)
-
-
 def test_a_problem_streams_the_regressor_in_blocks_as_often_as_wanted(ur5, rng):
-    motion = trajectory(ur5, rng)
-    problem = build_problem(ur5, motion)
-    W = joint_torque_regressor(ur5, motion.q, motion.v, motion.a)
+    m = motion(ur5, rng, 1200)
+    problem = build_problem(ur5, m)
+    W = joint_torque_regressor(ur5, m.q, m.v, m.a)
     for _ in range(2):
         blocks = list(problem.blocks())
         assert len(blocks) == 3
         np.testing.assert_array_equal(np.vstack([block[0] for block in blocks]), W)
         tau = np.concatenate([block[1] for block in blocks])
-        np.testing.assert_array_equal(tau, motion.tau.reshape(-1))
+        np.testing.assert_array_equal(tau, m.tau.reshape(-1))
 
 
 def test_a_trajectory_of_other_joints_is_refused(ur5, panda, rng):
     with pytest.raises(DataError, match="has the joints shoulder_pan_joint, shoulder_lift"):
-        build_problem(panda, trajectory(ur5, rng))
+        build_problem(panda, motion(ur5, rng, 1200))
     with pytest.raises(DataError, match=r"weight has shape \(3,\), expected \(1200, 6\)"):
-        build_problem(ur5, trajectory(ur5, rng), np.ones(3))
+        build_problem(ur5, motion(ur5, rng, 1200), np.ones(3))
     with pytest.raises(DataError, match=r"v and a have shapes"):
         joint_torque_regressor(ur5, np.zeros((2, 6)), np.zeros((2, 5)), np.zeros((2, 6)))
-    v = np.zeros((4, 6))
-    v[3, 1] = np.nan
-    with pytest.raises(DataError, match=r"v\[3\] of .* is nan, expected a finite number"):
-        joint_torque_regressor(ur5, 0 * v, v, 0 * v)
-
-
-@pytest.mark.parametrize("robot", ["ur5", "panda"])
-def test_the_regressor_of_one_instant_is_that_of_many(robot, request, rng):
-    model = request.getfixturevalue(robot)
-    n, p = len(model.joints), len(model.layout.names)
-    q, v, a = rng.uniform(-1, 1, (3, 5, n))
-    columns = np.arange(0, p, 2)
-    instant = InstantRegressor(model, columns)
-    expected = joint_torque_regressor(model, q, v, a).reshape(5, n, p)[..., columns]
-    for k in range(5):
-        np.testing.assert_allclose(instant(q[k], v[k], a[k]), expected[k], atol=1e-14)
 
 
 def test_samples_are_shuffled_without_loss(rng):

@@ -55,6 +55,14 @@ class Plant:
             if key not in ("joint", "effort_limit")
         }
 
+    @property
+    def parameters(self) -> np.ndarray:
+        """The standard parameters of the URDF's bodies and of the drives."""
+        pi, names = self.model.standard_parameters(), self.model.layout.names
+        for name in self.truth.keys() & set(names):
+            pi[names.index(name)] = self.truth[name]
+        return pi
+
 
 def plant(name, rng, **changes):
     """Return one of these robots with drives drawn about their typical values, some changed."""
@@ -112,13 +120,9 @@ def loaded(plant, rate, step=_STEP, *, as_exported=False):
     by step / 2 (kd + viscous): the plant's is lighter by that, unless it is to be as exported. Its
     roll-outs are then those of the smallest steps to 0.02 mrad.
     """
-    pi = plant.model.standard_parameters()
-    names = plant.model.layout.names
+    pi = plant.parameters
     if plant.bodies is not None:
         pi[: plant.model.layout.n_inertial] = plant.bodies
-    for drive in plant.drives:
-        for term in ("armature", "viscous", "coulomb", "offset"):
-            pi[names.index(f"{drive.joint}.{term}")] = getattr(drive, term)
     exact = 1.0 / rate / np.ceil(1.0 / rate / step - 1e-9)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "plant.xml"

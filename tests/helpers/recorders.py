@@ -1,11 +1,13 @@
 """Writers of log files as robots write them: each format by its own library."""
 
 import json
+import re
 
 import hdf5storage
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import pytest
 import scipy.io
 from mcap.writer import Writer as McapLibraryWriter
 from mcap_ros2.writer import Writer as McapWriter
@@ -14,10 +16,20 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Bag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from robotid.base.exceptions import DataError
 from robotid.data.log import COLUMNS
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 FIELDS = {"position": "q", "velocity": "v", "effort": "tau"}
+
+
+def refused(text):
+    return pytest.raises(DataError, match="^" + re.escape(text) + "$")
+
+
+def assert_same(back, log, names=("t", "q", "v", "tau")):
+    for name in names:
+        np.testing.assert_array_equal(getattr(back, name), getattr(log, name), name)
 
 
 def messages_of(log):

@@ -12,6 +12,7 @@ import robotid
 from robotid.cli.replay import replay_identified
 from robotid.data.base_motion import BaseMotion
 from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.torque import predict
 from robotid.estimation.estimators import WLS
 from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.identification.repeated_errors import with_repeated_errors
@@ -103,24 +104,7 @@ def test_unseen_motion_is_predicted_judged_and_drawn_by_the_joints(found, monkey
     np.testing.assert_allclose(noise, np.arange(7.0, 19.0))  # without the rows of the base
 
 
-def test_the_residual_at_the_truth_is_the_noise(found):
-    """What contact forces cannot cause is equal in MuJoCo and in the rows."""
-    from robotid.dynamics.torque import predict
-
-    result, truth, _ = found
-    recording = result.fitted[0].recording
-    motion, used = recording.trajectory, recording.mask
-    (torque,) = predict(result.model, [truth], motion)
-    level = np.sqrt(np.mean((motion.tau - torque)[used] ** 2))
-    assert level < 0.6 * TORQUE  # the filter leaves 2 * 25 / 500 of the noise's power
-    assert used.all()  # forces of changing contacts are eliminated, no sample is lost
-    share = motion.contacts.mean(axis=0)
-    assert ((share > 0.6) & (share < 1.0)).any()
-
-
 def test_contacts_without_flags_are_found(go1, trot):
-    from robotid.dynamics.torque import predict
-
     whole = trot[0].window(0.5, 6.5)
     log = replace(whole, base=BaseMotion(whole.base.pose))
     for base in (log.base, whole.base):
@@ -137,8 +121,6 @@ def test_contacts_without_flags_are_found(go1, trot):
 
 
 def test_an_imu_replaces_position_and_velocity_of_the_base(go1, trot):
-    from robotid.dynamics.torque import predict
-
     log, truth = trot[0].window(0.5, 6.5), truth_of(go1)
     pose = log.base.pose * np.append(np.zeros(3), np.ones(4))
 

@@ -3,7 +3,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.fitting import fit, identify
-from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 import robotid
@@ -16,23 +15,8 @@ from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.identification.pipeline import conclude
 from robotid.identification.summary import error_lines, friction_lines, one_more_gain, verdict_lines
-from robotid.robot.model import RobotModel
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0, velocity="measured")
-
-
-@pytest.mark.parametrize("estimator", ["ols", "wls", "consistent"])
-def test_exact_data_give_exact_parameters(panda, rng, estimator):
-    pi = truth(panda)
-    logs = [exact_log(panda, pi, rng) for _ in range(2)]
-    kept, find = exact_log(panda, pi, rng), identify if estimator == "consistent" else fit
-    found = find(panda, logs, validation=[kept], signals=EXACT, estimator=estimator)
-    beta = found.mapping.to_base(pi)
-    assert np.linalg.norm(found.base - beta) < 1e-8 * np.linalg.norm(beta)
-    errors = [
-        m.relative_error_pct for m in found.validation[0].metrics["estimate"].per_joint.values()
-    ]
-    assert max(errors) < 1e-5
 
 
 def test_data_that_excite_too_little_are_refused_by_least_squares_only(ur5, rng):
@@ -57,18 +41,19 @@ def test_torques_that_are_all_0_are_refused(ur5, rng):
     identify(ur5, [off, log], signals=EXACT)
 
 
-def test_a_recording_that_was_fitted_does_not_show_what_repeats(rng):
+def test_a_recording_that_was_fitted_does_not_show_what_repeats(planar, rng):
     """Of validation recordings, those that hold fitted rows do not count."""
-    arm = RobotModel.from_urdf(ROOT / "urdf" / "planar_2r.urdf")
     logs = [
-        replace(exact_log(arm, truth(arm), rng, samples=300, noise=0.1), path=f"/logs/{name}.csv")
+        replace(
+            exact_log(planar, truth(planar), rng, samples=300, noise=0.1), path=f"/logs/{name}.csv"
+        )
         for name in "abc"
     ]
-    own, kept = ([hold_log(arm, log, EXACT) for log in some] for some in (logs[:1], logs[1:]))
-    mapping, choice = structural_mapping(arm), EstimatorSettings("wls")
+    own, kept = ([hold_log(planar, log, EXACT) for log in some] for some in (logs[:1], logs[1:]))
+    mapping, choice = structural_mapping(planar), EstimatorSettings("wls")
     for beside, repeated, is_doubted in (([kept[0], own[0]], "b", True), (kept, "b", False)):
         guesses = [Finding("repeated_motion", "warning", f"{name}.csv", "") for name in repeated]
-        recordings = Recordings(arm, mapping, own, beside)
+        recordings = Recordings(planar, mapping, own, beside)
         found = conclude(recordings, choice, guesses, friction="none")
         assert found.validation[1].is_refitted == (beside[1] is own[0])
         assert ("repeated_motion" in {doubt.code for doubt in found.warnings}) == is_doubted
@@ -118,10 +103,9 @@ def test_a_drive_term_at_its_bound_has_no_error_and_what_stands_moved_little(ur5
             assert abs(found.standard[i] - found.prior[i]) <= 0.3 * found.prior_std[i]
 
 
-def test_its_text_has_verdict_reasons_and_every_joint(rng):
-    arm = RobotModel.from_urdf(ROOT / "urdf" / "planar_2r.urdf")
-    log, kept = (exact_log(arm, truth(arm), rng, samples=800, noise=0.1) for _ in range(2))
-    found = robotid.identify(arm, [log], validation=[kept])
+def test_its_text_has_verdict_reasons_and_every_joint(planar, rng):
+    log, kept = (exact_log(planar, truth(planar), rng, samples=800, noise=0.1) for _ in range(2))
+    found = robotid.identify(planar, [log], validation=[kept])
     text = str(found)
     assert text == found.summary()
     assert text.splitlines()[0].endswith(f"verdict {found.verdict.status}")

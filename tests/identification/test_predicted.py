@@ -49,15 +49,6 @@ def test_torques_are_those_of_the_evaluation_with_the_chosen_friction(found, loa
         np.testing.assert_allclose(one, torque[7], rtol=0, atol=1e-12)
 
 
-def test_at_rest_gravity_and_offsets_are_left(found):
-    names, pi = list(found.model.layout.names), found.standard
-    q = np.array([0.3, -0.4, 0.5])
-    robot = found.model.with_parameters(pi).pin_model
-    gravity = pin.computeGeneralizedGravity(robot, robot.createData(), q)
-    offsets = [pi[names.index(f"{joint}.offset")] for joint in found.model.joints]
-    np.testing.assert_allclose(found.predict(q), gravity + offsets, atol=1e-12)
-
-
 def test_a_friction_curve_is_that_of_the_speeds_fitted_under_the_usual_load(found, loaded):
     (evaluation,) = found.fitted
     j = found.model.joints.index(ELBOW)

@@ -80,18 +80,8 @@ def test_the_page_is_whole_and_offline(written):
 
 
 @pytest.fixture(scope="module")
-def folder(written):
-    return written[0]
-
-
-@pytest.fixture(scope="module")
-def content(written):
-    return written[1]
-
-
-@pytest.fixture(scope="module")
-def html(folder):
-    return (folder / "paper.html").read_text(encoding="utf-8")
+def html(written):
+    return (written[0] / "paper.html").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +89,8 @@ def shown(html):
     return tables(html)
 
 
-def test_the_inertial_vector_is_in_the_papers_order(shown, content, folder, html):
+def test_the_inertial_vector_is_in_the_papers_order(shown, written, html):
+    folder, content = written
     assert "nearest to the initial values (half of the true ones) that have the four sums" in html
     vector = content["inertial_vector"]
     order = ["Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mcx", "mcy", "mcz", "m"]  # (9)
@@ -132,7 +123,8 @@ def test_the_inertial_vector_is_in_the_papers_order(shown, content, folder, html
     np.testing.assert_allclose(found[[4, 6, 14, 16]], true[[4, 6, 14, 16]] / 2)
 
 
-def test_the_page_is_good_only_if_every_model_has_converged(content, shown):
+def test_the_page_is_good_only_if_every_model_has_converged(written, shown):
+    content = written[1]
     table = shown["Relative error |P̂ − P| / |P|"].rows
     for row, model in zip(table, content["models"].values(), strict=True):
         errors = [number(model["relative_error"][k], ".2g") for k in (0, 1, 10, -1)]

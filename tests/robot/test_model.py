@@ -93,12 +93,13 @@ def test_joints_come_in_the_order_asked_for(tmp_path):
 
 
 @pytest.mark.parametrize("axis", ["0 1 0", "1 2 3"])
-def test_a_locked_continuous_joint_gives_the_torque_at_its_angle(tmp_path, rng, axis):
-    model = RobotModel.from_urdf(
-        write(tmp_path, "continuous", axis), joints=["shoulder"], locked={"elbow": 2.3}
-    )
+@pytest.mark.parametrize(("kind", "nq"), [("continuous", 3), ("revolute", 2)])
+def test_a_locked_joint_gives_the_torque_at_its_angle(tmp_path, rng, axis, kind, nq):
+    limit = '<limit lower="-9" upper="9" effort="1" velocity="1"/>'
+    path = write(tmp_path, kind, axis, limit)
+    model = RobotModel.from_urdf(path, joints=["shoulder"], locked={"elbow": 2.3})
     whole = pin.buildModelFromUrdf(model.tree.path)
-    assert whole.nq == 3  # the elbow as cosine and sine
+    assert whole.nq == nq  # a continuous elbow as cosine and sine
     data, neutral = whole.createData(), pin.neutral(whole)
     for q, v, a in rng.uniform(-1, 1, (5, 3)):
         at = pin.integrate(whole, neutral, np.array([q, 2.3]))
@@ -173,6 +174,15 @@ BAD = {
     ),
     "unknown mimic mode": (dict(mimic="yes"), "'yes', expected one of independent, coupled"),
     "gravity of two numbers": (dict(gravity=(0, 9.81)), "expected three finite numbers"),
+    "locked at nan": (dict(locked={"elbow": float("nan")}), "locked at nan, expected a number"),
+    "locked at inf": (dict(locked={"elbow": float("inf")}), "locked at inf, expected a number"),
+    "locked too far": (dict(locked={"elbow": 1e308}), "locked at 1e+308, expected a number"),
+    "locked at text": (dict(locked={"elbow": "x"}), "locked at 'x', expected a number"),
+    "gravity 1e308": (dict(gravity=(0, 0, 1e308)), "gravity is 0, 0, 1e+308, expected three"),
+    "gravity nan": (dict(gravity=(0, float("nan"), 0)), "gravity is 0, nan, 0, expected three"),
+    "gravity in mm": (dict(gravity=(0, 0, -9810)), "three finite numbers within +-100 [m/s^2]"),
+    "gravity of text": (dict(gravity=("a", "b", "c")), "gravity is a, b, c, expected three finite"),
+    "no gravity": (dict(gravity=None), "gravity is None, expected three finite"),
 }
 
 
@@ -184,9 +194,7 @@ def test_a_wrong_request_names_what_is_wrong(tmp_path, options, message):
 
 
 FAULTS = {
-    "NaN mass": ('value="2"', 'value="nan"', "link 'upper': inertial mass value is 'nan'"),
     "negative mass": ('value="2"', 'value="-2"', "link 'upper': inertial mass is -2 kg, expected"),
-    "text for a number": ('ixx="0.1"', 'ixx="0,1"', "link 'upper': inertial inertia ixx is '0,1'"),
     "two numbers in xyz": ('"0.5 0 0"', '"0.5 0"', "joint 'elbow': origin xyz is '0.5 0'"),
     "no axis": ('axis xyz="0 1 0"', 'axis xyz="0 0 0"', "axis xyz is zero"),
     "planar joint": ('type="revolute"', 'type="planar"', "has type 'planar'"),
@@ -313,12 +321,6 @@ def chain(tmp_path):
     return write
 
 
-def test_only_joints_with_a_degree_of_freedom_move(chain):
-    tree = read_tree(chain(("revolute", LIMIT.format(-1, 2)), ("fixed", ""), ("prismatic", "")))
-    assert [joint.name for joint in tree.movable] == ["j1", "j3"]
-    assert [joint.name for joint in tree.joints] == ["j1", "j2", "j3"]
-
-
 def test_limits_are_those_stated_and_a_continuous_joint_has_no_range(chain):
     limit = LIMIT.format(-1, 2)
     turn, endless, point = read_tree(
@@ -335,11 +337,6 @@ def test_limits_that_no_joint_has_are_none(chain):
     wound = read_tree(chain(("revolute", LIMIT.format(-12.6, 12.6)))).movable[0]
     assert [joint.turns_freely for joint in (wide, wound)] == [True, False]
     assert [joint.has_limits for joint in (wide, wound)] == [False, True]
-
-
-def test_what_mimic_leaves_out_is_one_and_zero(chain):
-    tree = read_tree(chain(("revolute", ""), ("revolute", '<mimic joint="j1"/>')))
-    assert tree.joints[1].mimic == ("j1", 1.0, 0.0)
 
 
 def test_a_mimic_of_a_mimic_follows_the_first_with_both_ratios_and_offsets(chain):
@@ -362,15 +359,6 @@ def test_a_mimic_joint_stands_where_its_locked_leader_puts_it(chain):
     model = RobotModel.from_urdf(path, mimic="coupled", locked={"j2": 0.5})
     assert model.joints == ("j1",)
     assert dict(model.locked) == {"j2": 0.5, "j3": 1.25}
-
-
-@pytest.mark.parametrize("kind", ["revolute", "continuous"])
-def test_a_locked_joint_is_lumped_at_its_angle(chain, kind):
-    model = RobotModel.from_urdf(chain(("revolute", ""), (kind, "")), locked={"j2": 0.3})
-    m, mcx, mcy = model.standard_parameters()[:3]
-    assert m == pytest.approx(3.0)
-    assert mcx == pytest.approx(1 * 0.1 + 2 * (0.5 + 0.1 * np.cos(0.3)))
-    assert mcy == pytest.approx(2 * 0.1 * np.sin(0.3))
 
 
 def test_a_mass_that_nothing_can_be_divided_by_is_refused(chain):
@@ -552,26 +540,6 @@ def test_no_path_of_a_mesh_breaks_anything(tmp_path, mesh):
     run_urdf(HostileUrdf(content.encode(), dict(FILES)), tmp_path)
 
 
-DOORS = {
-    "locked at nan": (dict(locked={"elbow_joint": float("nan")}), "locked at nan, expected a"),
-    "locked at inf": (dict(locked={"elbow_joint": float("inf")}), "locked at inf, expected a"),
-    "locked too far": (dict(locked={"elbow_joint": 1e308}), "locked at 1e+308, expected a number"),
-    "locked at text": (dict(locked={"elbow_joint": "x"}), "locked at 'x', expected a number"),
-    "gravity 1e308": (dict(gravity=(0, 0, 1e308)), "gravity is 0, 0, 1e+308, expected three"),
-    "gravity nan": (dict(gravity=(0, float("nan"), 0)), "gravity is 0, nan, 0, expected three"),
-    "gravity in mm": (dict(gravity=(0, 0, -9810)), "three finite numbers within +-100 [m/s^2]"),
-    "gravity of text": (dict(gravity=("a", "b", "c")), "gravity is a, b, c, expected three finite"),
-    "no gravity": (dict(gravity=None), "gravity is None, expected three finite"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("options", "message"), DOORS.values(), ids=DOORS)
-def test_no_number_reaches_pinocchio_unchecked(options, message):
-    with pytest.raises(ModelError) as caught:
-        RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), **options)
-    assert message in str(caught.value)
-
-
 @pytest.mark.parametrize("ratio", [float("nan"), float("-inf"), 1e300])
 def test_ratios_of_couplings_are_checked(ratio):
     coupling = Coupling("motor", (("elbow_joint", ratio), ("wrist_1_joint", 1.0)))
@@ -664,10 +632,6 @@ def test_only_files_of_meshes_inside_their_package_are_read(tmp_path):
 
 
 def test_motions_that_are_no_numbers_are_refused():
-    import numpy as np
-
-    from robotid.dynamics.torque import joint_torque_regressor
-
     model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), free_flyer=True)
     q, v = np.zeros((3, 13)), np.zeros((3, 12))
     with pytest.raises(DataError, match=r"q\[0, 3:7\], the quaternion of the base, has length 0"):

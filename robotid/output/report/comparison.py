@@ -416,12 +416,11 @@ _PARAMETERS = (
 
 def fleet_page(content: Mapping[str, Any]) -> str:
     """Return the HTML of the page."""
-    unlike = content["unlike"]
     facts = {
         "Units": f"{content['done']} of {content['units']} identified",
         "Logs": str(content["logs"]),
         "Verdicts": ", ".join(f"{n} {escape(v)}" for v, n in content["verdicts"].items()) or "none",
-        "Units that differ": str(len({entry["unit"] for entry in unlike})),
+        "Units that differ": str(len({entry["unit"] for entry in content["unlike"]})),
     }
     sections = {
         "units": ("Units", _units(content)),
@@ -442,7 +441,7 @@ def _units(content: Mapping[str, Any]) -> str:
         link = f'<a href="{escape(entry["report"])}">report</a>' if entry["report"] else "–"
         verdict = text(entry["verdict"], flag=entry["verdict"] in _ORDER[:2])
         shown = {"verdict": verdict, "reason": words + entry["reason"]}
-        rows.append(entry | shown | {"report": Cell(link, "text")})
+        rows.append({**entry, **shown, "report": Cell(link, "text")})
     return listing("Units, the worst first", _UNITS, rows, is_data=True)
 
 

@@ -13,6 +13,7 @@ from helpers.recorders import (
     get_types_from_msg,
     joint_state,
     messages_of,
+    refused,
     to_ns,
     types_of,
     write_bag,
@@ -35,10 +36,6 @@ from robotid.data.signal_settings import LogSource
 JOINTS = ("shoulder", "elbow")
 STATE = "sensor_msgs/msg/JointState"
 HOW = "(job file table [log], CLI --topic, Python source=LogSource(topic=...))"
-
-
-def refused(text):
-    return pytest.raises(DataError, match="^" + re.escape(text) + "$")
 
 
 def make_log(**changes):

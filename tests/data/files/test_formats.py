@@ -17,7 +17,9 @@ import pytest
 import scipy.io
 from helpers.recorders import (
     StoragePlugin,
+    assert_same,
     messages_of,
+    refused,
     wide,
     write_mat5,
     write_mat73,
@@ -39,15 +41,6 @@ from robotid.data.signal_settings import LogSource, LogUnits
 JOINTS = ("shoulder", "elbow")
 HOW = "(job file table [log], CLI --topic, Python source=LogSource(topic=...))"
 WRITTEN = [".csv", ".parquet", ".npz", ".h5", ".hdf5", ".mat"]
-
-
-def assert_same(back, log, names=("t", "q", "v", "tau")):
-    for name in names:
-        np.testing.assert_array_equal(getattr(back, name), getattr(log, name), name)
-
-
-def refused(text):
-    return pytest.raises(DataError, match="^" + re.escape(text) + "$")
 
 
 def npz_columns(path, log):

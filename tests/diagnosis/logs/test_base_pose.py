@@ -61,13 +61,6 @@ def with_quaternion(log, change):
     return replace(log, base=BaseMotion(pose))
 
 
-def test_signs_of_quaternions_have_no_effect(robot, log):
-    signs = np.where(np.random.default_rng(0).random(len(log.t)) < 0.5, -1.0, 1.0)
-    flipped = with_quaternion(log, lambda q: signs[:, None] * q)
-    assert not list(check_base(robot, flipped, SLOW))
-    assert np.abs(flipped.base.pose - log.base.pose).max() < 1e-15
-
-
 QUATERNIONS = [
     (lambda q: np.roll(q, 1, axis=1), "its order is qw qx qy qz"),
     (lambda q: q * [-1.0, -1.0, -1.0, 1.0], "it is the orientation of the world in the base"),

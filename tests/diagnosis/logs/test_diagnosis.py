@@ -9,7 +9,6 @@ import pinocchio as pin
 import pytest
 from helpers.corruptions import CASES, NOISE, ROBOTS, clean_log, controlled_log, robot, table_of
 from helpers.driven import arm
-from helpers.paths import ROOT
 from helpers.synthetic import exact_log, perfect, truth
 
 from robotid.cli import main
@@ -342,14 +341,6 @@ def test_what_makes_a_result_wrong_leads_its_verdict_unless_it_is_ignored(
     assert result["settings"]["doctor"] == {"ignore": ["torque_sign"]}
 
 
-def test_findings_change_no_data(ur5, short):
-    log = replace(short, tau=short.tau.copy(), q=short.q.copy())
-    before = log.tau.copy(), log.q.copy()
-    diagnose(ur5, [log], [log], SIGNALS)
-    np.testing.assert_array_equal(log.tau, before[0])
-    np.testing.assert_array_equal(log.q, before[1])
-
-
 def test_a_log_of_standing_still_is_said_to_be_one(short, tmp_path):
     q = short.q
     still = replace(short, q=np.tile(q[0], (len(q), 1)), v=np.zeros_like(q))
@@ -464,11 +455,6 @@ def test_joints_that_turn_freely_but_are_stated_without_limits_are_named(recordi
 
 # --- repeated motions and excitation --------------------------------------------------------------
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
-
-
-@pytest.fixture(scope="module")
-def planar():
-    return RobotModel.from_urdf(ROOT / "urdf" / "planar_2r.urdf")
 
 
 @pytest.fixture(scope="module")

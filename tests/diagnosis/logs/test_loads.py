@@ -49,12 +49,6 @@ def test_a_scale_that_all_joints_share_is_said_once(ur5, ur5_log, factor):
     assert found.evidence["joints"] == 6
 
 
-def test_one_current_among_torques_is_said_of_its_joint(ur5, ur5_log):
-    scale = np.array([1.0, 0.08, 1.0, 1.0, 1.0, 1.0])
-    found = loads(ur5, replace(ur5_log, tau=scale * ur5_log.tau))
-    assert found == [("current_for_torque", "run.csv: shoulder_lift_joint")]
-
-
 def test_torques_that_no_physics_explains_have_no_scale(ur5, ur5_log):
     rng = np.random.default_rng(0)
     shuffled = rng.permutation(ur5_log.tau, axis=0)

@@ -34,12 +34,6 @@ def model():
     return RobotModel.from_urdf(example_urdf("ur5_robot.urdf"))
 
 
-@pytest.fixture(scope="module")
-def four(model):
-    """The first four joints: enough where nothing but one thing is to be found, and faster."""
-    return RobotModel.from_urdf(model.tree, joints=model.joints[:4])
-
-
 SETTINGS = EstimatorSettings(prior_weight=1.0)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers import driven as helper
-from helpers.driven import ELBOW, JOINTS, arm, driven, driven_log
+from helpers.driven import ELBOW, JOINTS, driven, driven_log
 from helpers.stands import recorded, stand
 
 import robotid
@@ -51,11 +51,6 @@ CASES = {
     "spring_table": ((), (2.0, 1.0, -1.0, -2.0, 1.0, 2.0, 3.0, 1.0)),
 }
 ALIKE = {"tanh": {"tanh", "stribeck"}, "stribeck": {"tanh", "stribeck"}}
-
-
-@pytest.fixture(scope="module")
-def plain():
-    return arm()
 
 
 @pytest.fixture(scope="module")

@@ -74,12 +74,6 @@ def three(ur5):
 
 
 @pytest.fixture(scope="module")
-def four(ur5):
-    """With the first wrist joint."""
-    return RobotModel.from_urdf(ur5.tree, joints=ur5.joints[:4])
-
-
-@pytest.fixture(scope="module")
 def clean(three):
     """The robot of seed 1 whose drives have nothing beside their model."""
     return identified(three, 1)
@@ -132,10 +126,6 @@ def test_a_coupling_of_some_share_needs_that_of_the_other_joint(monkeypatch):
     terms = [SimpleNamespace(joint=j, share=x, term=SimpleNamespace(coupled=o)) for j, o, x in rows]
     monkeypatch.setattr(misfit, "_of_joint", lambda sample, j: [terms[j]])
     assert find_misfits(SimpleNamespace(joints=rows)) == tuple(terms[k] for k in (0, 1, 3, 4))
-
-
-def test_nothing_is_named_where_nothing_is_missing(clean):
-    assert misfits(clean) == ()
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.driven import ELBOW, LIFT, arm, driven, driven_log, found_in
+from helpers.driven import ELBOW, LIFT, driven, driven_log, found_in
 
 from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.residual.misfit import find_misfits
@@ -20,11 +20,6 @@ from robotid.robot.drives import LoadFriction, Stribeck
 
 QUANTILE = 1.5
 PLAIN = "viscous+coulomb"
-
-
-@pytest.fixture(scope="module")
-def plain():
-    return arm()
 
 
 @pytest.fixture(scope="module")

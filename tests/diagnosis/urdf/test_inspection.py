@@ -94,7 +94,7 @@ def test_a_moving_link_without_inertial_is_named(tmp_path):
     (finding,) = found(massless, "missing_inertial")
     assert (finding["link"], finding["severity"]) == ("lower", "warning")
     assert (
-        "the URDF has no <inertial> with a mass: lower. Assumed: the masses of"
+        "the URDF has no <inertial> with a mass: lower. robotid assumes the masses of"
         in (finding["message"])
     )
     # a box of 0.2 of the robot's length, 0.5 m, with the density of the other body
@@ -138,7 +138,6 @@ FAULTS = [
     ("</robot>", TOOL.format(inertial=INERTIAL.format(m=0.3)), "fixed_lumped", "link lower", "note",
      "is one body with tool, attached by fixed joints"),
     ('value="2"', 'value="nan"', "not_a_number", "link upper", "error", "mass value is 'nan'"),
-    ('xyz="0.1 0 0"', 'xyz="0,1 0 0"', "not_a_number", "link upper", "error", "xyz is '0,1 0 0'"),
     ('xyz="0.5 0 0"', 'xyz="${l} 0 0"', "not_a_number", "joint elbow", "error", "'${l} 0 0'"),
     ('lower="-1"', 'lower=""', "not_a_number", "joint shoulder", "error", "limit lower is ''"),
     ('damping="0.5"', 'damping="nan"', "not_a_number", "joint shoulder", "error", "damping"),
@@ -164,12 +163,6 @@ def test_a_fit_is_warned_of_impossible_inertias_only(tmp_path):
 def test_the_inertia_may_be_stated_in_a_turned_frame(tmp_path):
     turned = inspected(tmp_path, ('<origin xyz="0.1 0 0"/>', '<origin xyz="0 0 0" rpy="1 2 3"/>'))
     assert turned.to_dict()["findings"] == []
-
-
-def test_angles_that_are_exact_or_meant_are_not_named(tmp_path):
-    for angle in (math.pi, -math.pi / 2, 1.5707963, 3.13, 0.0005, 0.0):
-        inspection = inspected(tmp_path, ('rpy="0 0 0"', f'rpy="0 {angle!r} 0"'))
-        assert found(inspection, "rounded_rpy") == [], angle
 
 
 COARSE = ('<origin xyz="0.5 0 0"/>', '<origin xyz="0.5 0 0" rpy="3.14 0 0"/>')
@@ -319,10 +312,6 @@ def audit(tmp_path, **changed):
     return list(audit_links(RobotModel.from_urdf(path)))
 
 
-def test_inertials_that_fit_their_geometry_are_not_mentioned(tmp_path):
-    assert audit(tmp_path) == []
-
-
 @pytest.mark.parametrize(
     ("changed", "code", "evidence"),
     [
@@ -330,7 +319,9 @@ def test_inertials_that_fit_their_geometry_are_not_mentioned(tmp_path):
         ({"mass": "400"}, "density", {"density": 100_000.0}),
         ({"mass": "0.02", "ixx": "3e-5", "iyy": "3e-4", "izz": "3e-4"}, "density",
          {"density": 5.0}),
-        ({"iyy": "0.56", "izz": "0.56"}, "gyration", None),
+        # the second moments add up to half the trace of the inertia
+        ({"iyy": "0.56", "izz": "0.56"}, "gyration",
+         {"gyration": np.sqrt(0.5 * (0.0067 + 1.12) / 4.0), "farthest": np.hypot(0.2, 0.005**0.5)}),
     ],
 )  # fmt: skip
 def test_what_the_geometry_does_not_allow_is_named_with_its_figure(
@@ -339,8 +330,7 @@ def test_what_the_geometry_does_not_allow_is_named_with_its_figure(
     found = audit(tmp_path, **changed)
     assert [finding.code for finding in found] == [code]
     assert found[0].where == "link upper"
-    if evidence is not None:
-        assert {key: found[0].evidence[key] for key in evidence} == pytest.approx(evidence)
+    assert {key: found[0].evidence[key] for key in evidence} == pytest.approx(evidence)
 
 
 @pytest.mark.parametrize(
@@ -367,13 +357,6 @@ def test_what_hardly_weighs_hardly_matters(tmp_path):
     for mass, severity in (("2.1015e-3", "note"), ("2.1030e-3", "warning")):  # of all: 2.1021 kg
         (first, *_) = audit(tmp_path, **light | {"mass": mass})
         assert (first.code, first.severity) == ("com_outside", severity)
-
-
-def test_the_radius_of_gyration_is_that_of_the_inertia(tmp_path):
-    (found,) = audit(tmp_path, iyy="0.56", izz="0.56")
-    # the second moments add up to half the trace of the inertia
-    assert found.evidence["gyration"] == pytest.approx(np.sqrt(0.5 * (0.0067 + 1.12) / 4.0))
-    assert found.evidence["farthest"] == pytest.approx(np.linalg.norm([0.2, 0.05, 0.05]))
 
 
 def test_an_ellipsoid_longer_than_its_box_allows_is_a_note_with_both_lengths(tmp_path):

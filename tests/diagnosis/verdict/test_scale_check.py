@@ -43,12 +43,6 @@ def found_of(model, pi, **constraints):
 
 
 @pytest.fixture(scope="module")
-def four(ur5):
-    """The first four joints of a UR5."""
-    return RobotModel.from_urdf(ur5.tree, joints=ur5.joints[:4])
-
-
-@pytest.fixture(scope="module")
 def alike(ur5):
     """A robot whose bodies are those of its URDF."""
     return found_of(ur5, near_urdf(ur5))

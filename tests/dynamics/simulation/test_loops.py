@@ -6,7 +6,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.mujoco_plant import LEG
-from helpers.paths import URDF
 from helpers.single_joint import slider
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
@@ -69,11 +68,6 @@ LASTING = (
 def legs():
     """Two legs, which the trunk alone joins."""
     return RobotModel.from_urdf(example_urdf("go2.urdf"), joints=list(LEGS))
-
-
-@pytest.fixture(scope="module")
-def planar():
-    return RobotModel.from_urdf(URDF / "planar_2r.urdf")
 
 
 def loops_of(model, terms=PLAIN, values=VALUES, *, kp=20.0, **changes):

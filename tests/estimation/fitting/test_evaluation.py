@@ -5,7 +5,6 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
-from robotid.dynamics.prepared_logs import row_mask
 from robotid.estimation.fitting.evaluation import (
     TorqueSums,
     _joined,
@@ -15,8 +14,6 @@ from robotid.estimation.fitting.evaluation import (
     shares_rows,
 )
 from robotid.estimation.fitting.recorded import hold_log
-from robotid.robot.model import RobotModel
-from robotid.robot.parameters import Coupling
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
 
@@ -80,35 +77,6 @@ def test_joints_are_hidden_whose_torque_changes_less_over_the_rows_used_than_is_
     assert hidden_joints(model, logs[:1]) == ("a", "b"), "the fourth has no row"
     full = SimpleNamespace(is_static=False, row_names=model.row_names, row_units=model.row_units)
     assert hidden_joints(full, logs) == ()
-
-
-def test_rows_of_slow_joints_and_slow_coupled_drives_are_left_out(ur5, rng):
-    coupling = Coupling("motor", (("wrist_2_joint", 1.0), ("wrist_3_joint", 1.0)))
-    coupled = RobotModel.from_urdf(ur5.tree.path, couplings=(coupling,))
-    trajectory = hold_log(ur5, exact_log(ur5, truth(ur5), rng), EXACT).whole.trajectory
-    v = trajectory.v
-    mask = row_mask(ur5, trajectory, 0.1)
-    np.testing.assert_array_equal(mask, np.abs(v) >= 0.1)
-    slow = np.abs(v[:, 4] + v[:, 5]) < 0.1
-    both = row_mask(coupled, trajectory, 0.1)
-    assert not both[slow][:, 4:].any()
-    np.testing.assert_array_equal(both[:, :4], mask[:, :4])
-    frictionless = RobotModel.from_urdf(ur5.tree.path, terms=("viscous",))
-    assert row_mask(frictionless, trajectory, 0.1).all()
-
-
-def test_a_slow_slider_is_slow_by_its_own_stroke():
-    from helpers.corruptions import robot
-
-    tiago = robot("tiago")  # its torso lifts 0.35 m: 0.02 rad/s is 1.1 mm/s of it
-    v = np.zeros((4, len(tiago.joints)))
-    v[:, 0] = [0.0010, 0.0012, 0.019, 0.021]
-    v[:, 1] = [0.019, 0.021, 0.019, 0.021]
-    q, rows = np.zeros_like(v), np.arange(4)
-    motion = Trajectory(rows / 1.0, q, v, q, q, tiago.joints, None, rows * 0)
-    mask = row_mask(tiago, motion, 0.02)
-    assert mask[:, 0].tolist() == [False, True, True, True]
-    assert mask[:, 1].tolist() == [False, True, False, True]
 
 
 def test_rows_recorded_twice_are_found_whatever_the_clock_says(ur5, rng):

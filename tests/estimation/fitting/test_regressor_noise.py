@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from helpers.findings import Figures
 from helpers.fitting import fit, identify
-from helpers.paths import ROOT
 from helpers.synthetic import truth
 
 from robotid.data.log import Log
@@ -27,15 +26,9 @@ from robotid.estimation.fitting.regressor_noise import (
     without_noise,
 )
 from robotid.estimation.fitting.standard_errors import measured_errors
-from robotid.robot.model import RobotModel
 
 RATE, STEP = 200.0, 2 * np.pi / 2**11  # [Hz], [rad]
 SIGNALS = SignalSettings(velocity="differentiated")
-
-
-@pytest.fixture(scope="module")
-def planar():
-    return RobotModel.from_urdf(ROOT / "urdf" / "planar_2r.urdf")
 
 
 @pytest.fixture(scope="module")

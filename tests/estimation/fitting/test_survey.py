@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.closed_chains import four_bar
+from helpers.corruptions import table_of
 from helpers.driven import arm
 from helpers.synthetic import truth
 
@@ -173,21 +174,12 @@ def test_a_locked_joint_has_the_positions_of_all_windows(robot, recording, tmp_p
     np.testing.assert_allclose(found[held], recording.q[rows, 0], rtol=1e-12)
 
 
-def spoilt(recording, tmp_path, name, row, value):
-    table = {"time": recording.t.copy()}
-    for j, joint in enumerate(recording.joints):
-        table[f"q_{joint}"] = recording.q[:, j].copy()
-        table[f"tau_{joint}"] = recording.tau[:, j].copy()
-    table[name][row] = value
-    path = tmp_path / "run.parquet"
-    write_columns(table, path)
-    return path
-
-
 def test_a_hole_in_the_last_piece_is_named_by_its_row_in_the_file(
     robot, recording, tmp_path, monkeypatch
 ):
-    path = spoilt(recording, tmp_path, "tau_elbow_joint", 1801, np.nan)
+    table, path = table_of(recording), tmp_path / "run.parquet"
+    hole = np.where(np.arange(len(recording.t)) == 1801, np.nan, 0.0)
+    write_columns(table | {"tau_elbow_joint": table["tau_elbow_joint"] + hole}, path)
     layout, table = lay_out(path, robot.joints)
     short = replace(layout, notes=())
     monkeypatch.setattr(survey, "WINDOW", 100)
@@ -198,17 +190,6 @@ def test_a_hole_in_the_last_piece_is_named_by_its_row_in_the_file(
     with pytest.raises(DataError, match=r"tau_elbow_joint is NaN at row 1801 \(t = ") as found:
         pieces[-1]()
     assert found.value.code == "not_finite"
-
-
-@pytest.mark.parametrize("row", [LENGTH, 2 * LENGTH, LENGTH + 1])
-def test_time_must_increase_where_pieces_meet_too(robot, recording, tmp_path, row):
-    path = spoilt(recording, tmp_path, "time", row, recording.t[row - 1])
-    with pytest.raises(DataError) as in_memory:
-        read_log(path, robot.joints)
-    with pytest.raises(DataError) as in_pieces:
-        long_log(robot, path, SignalSettings())
-    assert str(in_pieces.value) == str(in_memory.value)
-    assert f"t[{row}]" in str(in_pieces.value)
 
 
 def test_pieces_travel_as_they_are(robot, recording, tmp_path):

@@ -16,14 +16,6 @@ SIGNALS = SignalSettings(cutoff=30.0)
 DRIVEN = LoopSettings(kind="torque")
 
 
-def true_parameters(robot):
-    pi, names = robot.model.standard_parameters(), robot.model.layout.names
-    for name, value in robot.truth.items():
-        if name in names:
-            pi[names.index(name)] = value
-    return pi
-
-
 @pytest.fixture(scope="module")
 def arm():
     """A planar arm in MuJoCo, a log to fit and one kept apart: positions and torques."""
@@ -69,7 +61,7 @@ def test_what_is_fed_forward_is_the_mean_torque_between_two_rows():
 def test_the_true_robot_does_under_its_torque_what_mujocos_does(arm):
     robot, rng = arm[0], np.random.default_rng(8)
     log = driven_log(robot.model, torque_log(robot, rng, duration=2.0, rate=500.0), SIGNALS)
-    loops = open_loops(robot.model, true_parameters(robot))
+    loops = open_loops(robot.model, robot.parameters)
     run = run_open_loop(ClosedLoopRobot(robot.model, step=1e-3), loops, log)
     # its friction is soft over 1e-2 rad/s, ours over 1e-4
     assert (run.rmse < 3e-3).all()

@@ -128,22 +128,13 @@ def test_every_value_is_a_body_that_can_be(simulator, rng):
     np.testing.assert_allclose(ratio, [np.exp(0.2), 1.0, 1.0], rtol=1e-9)
 
 
-def truth_of(arm):
-    """The standard parameters of a plant, and its loops."""
-    pi, names = arm.model.standard_parameters(), arm.model.layout.names
-    for drive in arm.drives:
-        for term in ("armature", "viscous", "coulomb"):
-            pi[names.index(f"{drive.joint}.{term}")] = getattr(drive, term)
-    return loops_of(arm.model, pi, arm.drives)
-
-
 @pytest.fixture(scope="module")
 def told():
     """A planar arm whose commands act within the third row of 2 ms, its loops, and its log."""
     rng = np.random.default_rng(6)
     arm = plant("planar", rng, delay=0.0053)
     log, _ = recorded(arm, rng, duration=2.0, torque=0.3, step=5e-5)
-    return arm, truth_of(arm), log
+    return arm, loops_of(arm.model, arm.parameters, arm.drives), log
 
 
 def with_torques(outs, tau):
@@ -231,7 +222,10 @@ def noisy_windows(rng):
     t = np.arange(750) / 250.0
     q_ref = multisine(t, arm.middle, arm.reach, rng)
     log = Log(t, q_ref, 0 * q_ref, arm.model.joints, q_ref=q_ref, has_torque=False)
-    robot, loops = ClosedLoopRobot(arm.model, step=4e-3), truth_of(arm)
+    robot, loops = (
+        ClosedLoopRobot(arm.model, step=4e-3),
+        loops_of(arm.model, arm.parameters, arm.drives),
+    )
     [out] = robot.roll_out(loops, cut_windows(log, np.inf, 0.0))
     noisy = replace(log, q=out.q + 3e-4 * rng.standard_normal(out.q.shape))
     unknown = FreeParameter("delay", "delay", (0, 1), 0.006, 0.1)

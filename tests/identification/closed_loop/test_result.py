@@ -196,17 +196,13 @@ def leg():
                  noise=NOISE)[0]
         for k in range(4)
     ]  # fmt: skip
-    names, pi = robot.model.layout.names, robot.model.standard_parameters()
-    for name, value in robot.truth.items():
-        if name in names:
-            pi[names.index(name)] = value
     free = (
         FreeParameter("calf.coulomb", "term", (2,), calf.coulomb, 1.0, 0.0, term=Coulomb()),
         FreeParameter("hip.kp", "kp", (0,), hip.kp, np.inf, 1.0),
         FreeParameter("hip.delay", "delay", (0,), 0.006, 0.1, 0.0),
     )
     windows = [window for log in logs for window in cut_windows(log, 0.5, 0.1)]
-    base = loops_of(robot.model, pi, robot.drives)
+    base = loops_of(robot.model, robot.parameters, robot.drives)
     simulator = LoopSimulator(ClosedLoopRobot(robot.model), tuple(windows), base, free)
     estimate = Estimate(
         theta=simulator.prior, covariance=1e-6 * np.eye(3), names=simulator.names,

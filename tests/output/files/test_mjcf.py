@@ -79,36 +79,6 @@ def test_mass_matrix_and_forces_are_pinocchios(name, tmp_path):
         np.testing.assert_allclose(found, state.tau, atol=1e-9 * abs(state.tau).max(), rtol=0)
 
 
-def test_inverse_dynamics_on_a_log_are_the_fits(identified, tmp_path):
-    """Friction is a constraint to MuJoCo, sign(v) only where the joint moves."""
-    model, pi = identified.model, identified.standard
-    write_mjcf(model, pi, tmp_path / "robot.xml")
-    robot, data = load(tmp_path / "robot.xml")
-    robot.opt.disableflags = OFF.mjDSBL_LIMIT | OFF.mjDSBL_CONTACT
-    assert robot.nu == len(model.joints)
-    at = [robot.jnt_dofadr[named(robot, joint)] for joint in model.joints]
-    evaluation = identified.validation[0]
-    motion, wanted = evaluation.recording.trajectory, evaluation.torques["estimate"]
-    found = np.empty_like(wanted)
-    for k in range(len(motion.t)):
-        data.qpos[at], data.qvel[at], data.qacc[at] = motion.q[k], motion.v[k], motion.a[k]
-        mujoco.mj_inverse(robot, data)
-        # the control whose force, without the bias, moves the joint so
-        data.ctrl = 0.0
-        mujoco.mj_fwdActuation(robot, data)
-        found[k] = (data.qfrc_inverse - data.qfrc_actuator)[at]
-    moves = np.abs(motion.v) > 0.2  # [rad/s]
-    assert moves.mean() > 0.5
-    values = dict(zip(model.layout.names, pi, strict=True))
-    coulomb, offset = (
-        np.array([values[f"{joint}.{term}"] for joint in model.joints])
-        for term in ("coulomb", "offset")
-    )
-    assert np.abs([coulomb, offset]).min() > 0
-    wanted = wanted + coulomb * (np.sign(motion.v) - motion.direction)  # filtered as the torque is
-    np.testing.assert_allclose(found[moves], wanted[moves], atol=1e-9 * abs(wanted).max(), rtol=0)
-
-
 def test_limits_shapes_and_meshes(tmp_path):
     box = b"\0" * 80 + (4).to_bytes(4, "little")
     corners = np.vstack([np.zeros(3), np.eye(3)]).astype("<f4")

@@ -13,12 +13,7 @@ FINDINGS = [
 
 
 @pytest.fixture(scope="session")
-def findings():
-    return FINDINGS
-
-
-@pytest.fixture(scope="session")
-def report(identified, findings, tmp_path_factory):
+def report(identified, tmp_path_factory):
     """The report of the identified UR5, as HTML."""
     target = tmp_path_factory.mktemp("report") / "report.html"
-    return write_report(replace(identified, findings=findings), target).read_text(encoding="utf-8")
+    return write_report(replace(identified, findings=FINDINGS), target).read_text(encoding="utf-8")

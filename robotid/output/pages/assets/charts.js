@@ -37,7 +37,9 @@ matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
 
 function words(x, digits = 4) {
   if (!Number.isFinite(x)) return "–";
-  return String(Number(x.toPrecision(digits))).replaceAll("-", "−");
+  const isSmall = x !== 0 && Math.abs(x) < 1e-3; // a long number would move its neighbours
+  const text = isSmall ? Number(x.toPrecision(3)).toExponential() : String(Number(x.toPrecision(digits)));
+  return text.replaceAll("-", "−");
 }
 
 function powers(low, high) { // ticks of a logarithmic axis

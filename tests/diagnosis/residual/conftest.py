@@ -1,0 +1,7 @@
+import pytest
+from helpers.driven import arm
+
+
+@pytest.fixture(scope="session")
+def plain():
+    return arm()
