@@ -77,8 +77,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         if not first.among:
             about = {"type": first.kind, "metavar": first.metavar}
         add(f"--{name.replace('_', '-')}", help=_by_format(words), **about)
-    words = "print the projection of each friction term and what the format lacks"
-    add_shown(parser, "json", verbose=words)
+    more = "print the projection of each friction term and what the format lacks"
+    add_shown(parser, "json", verbose=more)
 
 
 def _by_format(words: Mapping[str, str]) -> str:

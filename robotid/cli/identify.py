@@ -460,8 +460,8 @@ def _drive_lines(result: Mapping[str, Any], *, is_verbose: bool) -> list[str]:
         value, _ = in_digits_of(entry["value"], entry["std_error"])
         drives.setdefault(owner, {})[f"{term}\n{entry['unit']}"] = value
     heads = dict.fromkeys(head for values in drives.values() for head in values)
-    rows = [[drive, *(values.get(head, "-") for head in heads)] for drive, values in drives.items()]
-    return columns(["drive\n", *heads], rows, width=terminal_width(), needed=2) + varied
+    table = [[drive, *(values.get(x, "-") for x in heads)] for drive, values in drives.items()]
+    return columns(["drive\n", *heads], table, width=terminal_width(), needed=2) + varied
 
 
 def _worst(result: Mapping[str, Any]) -> str:

@@ -125,6 +125,13 @@ def test_the_page_loads_and_plays_without_an_error_or_a_request(opened):
     assert "ghost: designed </script>" in seen.page.locator("#switches").inner_text()
 
 
+def test_a_motion_without_torques_is_shown_without_an_error(browser, ur5, tmp_path):
+    q, _ = motion(6)
+    with visit(browser, replay(ur5, T, q).write(tmp_path / "motion.html")) as seen:
+        seen.page.evaluate("replay.pause(); replay.seek(9)")
+        assert seen.errors == []
+
+
 def test_the_robot_is_drawn_where_pinocchio_says(still, ur5):
     q, _ = motion(6)
     data = ur5.pin_model.createData()

@@ -69,7 +69,7 @@ function drawSwitches() {
   }
   byId("residuals").hidden = !predictions;
   byId("arcs").hidden = !isTorque;
-  byId("most").textContent = `${scale.full} × ${scale.unit}`;
+  if (scale) byId("most").textContent = `${scale.full} × ${scale.unit}`;
   if (masses.length) place.after(massTable());
 }
 
