@@ -109,8 +109,8 @@ def check_payloads(
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("source", metavar="URDF")
-    add("logs", nargs="+", metavar="LOG", help="logs with the payload")
+    add("source", metavar="JOB.toml | URDF")
+    add("logs", nargs="*", metavar="LOG", help="logs with the payload, instead of a job file")
     words = "log without the payload, or a result.json or its folder; repeatable"
     add("--reference", required=True, metavar="LOG | RESULT", help=words, action="append")
     words = "link that carries the payload; default: the last moving link; repeatable"

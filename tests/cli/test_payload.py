@@ -65,6 +65,11 @@ def test_a_log_and_a_result_are_references_alike(files, capsys):
         for reference in ("bare.csv", "out", "out/result.json")
     ]  # fmt: skip
     assert found[0] == found[1] == found[2]
+    job = files / "loaded.toml"
+    job.write_text(f'urdf = "{ARM}"\n[[identification]]\nlog = "loaded.csv"\n')
+    words = ["payload", job, "--reference", files / "bare.csv", "--link", "tool0", "--json"]
+    assert main([*map(str, words)]) == 0
+    assert json.loads(capsys.readouterr().out) == found[0]
     (payload,) = found[0]["payloads"]
     assert payload["link"] == "tool0"
     assert payload["mass"] == pytest.approx(2.0, abs=4 * payload["mass_std_error"])
