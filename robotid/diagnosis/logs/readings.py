@@ -89,8 +89,7 @@ class _Motion:
         coupled, drive = drive[..., _DRIVE:], drive[..., :_DRIVE]
         logged = np.repeat(self.tau[:, None], len(self.rows), axis=1)
         bodies = (X * self.spread[self.moved])[..., self.spread[self.moved] > 0.0]
-        columns = [bodies, coupled, drive, urdf[..., None], logged]
-        P = np.concatenate(columns, axis=2).swapaxes(0, 1)
+        P = np.concatenate([bodies, coupled, drive, urdf[..., None], logged], axis=2).swapaxes(0, 1)
         edges = np.linspace(0, len(self.tau), self.segments + 1).astype(int).tolist()
         parts = [P[:, i:k] for i, k in pairwise(edges)]
         return np.array([part.swapaxes(1, 2) @ part for part in parts])  # (K, m, c, c)
@@ -319,10 +318,12 @@ def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
         order[[i, k]] = k, i
         yield Reading("torque_order", (i, k), partial(_reordered, order=order))
         yield Reading("position_order", (i, k), partial(_exchanged, i=i, k=k))
-        yield Reading("joint_order", (i, k), partial(_exchanged_both, i=i, k=k, order=order))
+        yield Reading(
+            "joint_order", (i, k), lambda s, i=i, k=k, o=order: _reordered(_exchanged(s, i, k), o)
+        )
     for j in rows:
         yield Reading("torque_sign", (j,), partial(_negated, on=one[j]))
-        yield Reading("joint_axis", (j,), partial(_reversed, j=j, on=one[j]))
+        yield Reading("joint_axis", (j,), lambda s, j=j: _negated(_mirrored(s, j), one[j]))
         if j in turning:
             yield Reading("position_sign", (j,), partial(_mirrored, j=j))
     for group in (samples.unsigned, *zip(samples.unsigned, strict=True)):
@@ -382,20 +383,12 @@ def _exchanged(samples: Samples, i: int, k: int) -> Samples:
     return samples.changed(q=q, v=v, a=a)
 
 
-def _exchanged_both(samples: Samples, i: int, k: int, order: Array) -> Samples:
-    return _reordered(_exchanged(samples, i, k), order)
-
-
 @lru_cache(maxsize=1)  # for two readings
 def _mirrored(samples: Samples, j: int) -> Samples:
     """Return the samples with the position of a joint negated."""
     sign = np.where(np.arange(samples.motion.q.shape[1]) == j, -1.0, 1.0)
     q, v, a = (sign * x for x in (samples.motion.q, samples.motion.v, samples.motion.a))
     return samples.changed(q=q, v=v, a=a)
-
-
-def _reversed(samples: Samples, j: int, on: Array) -> Samples:
-    return _negated(_mirrored(samples, j), on)
 
 
 def _turned(samples: Samples, j: int, turn: tuple[Array, bool]) -> Samples:

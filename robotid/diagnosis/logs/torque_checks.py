@@ -314,18 +314,17 @@ def _needed(model: LoadModel, scale: Array, other: Array) -> Array:
 
 def _scaled(probe: Probe, scale: Array, other: Array, name: str) -> Iterator[Finding]:
     joints, factors = [probe.model.joints[j] for j in other], scale[other].tolist()
-    code = "current_for_torque"
     if len(other) > 1 and np.ptp(np.log(factors)) < np.log(_ALIKE):
         factor = float(np.exp(np.log(factors).mean()))
         is_all = len(other) == len(scale)
         is_unit = is_all and abs(np.log(factor)) > np.log(_OTHER_UNIT)
         yield finding(
-            code, name, () if is_all else joints, severity="error" if is_unit else "warning",
-            factor=factor, joints=len(other), joint=listed(joints), also=False,
+            "current_for_torque", name, () if is_all else joints, joints=len(other), also=False,
+            severity="error" if is_unit else "warning", factor=factor, joint=listed(joints),
         )  # fmt: skip
         return
     for joint, factor in zip(joints, factors, strict=True):
-        yield finding(code, name, joint, factor=factor, also=False)
+        yield finding("current_for_torque", name, joint, factor=factor, also=False)
 
 
 def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Finding]:
