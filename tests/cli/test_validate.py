@@ -62,6 +62,10 @@ def test_another_motion_is_a_prediction(here):
     folder, _, other = here
     found = verdict(folder, other)
     assert found["status"] == "good", found["reasons"]
+    noisy = other.tau + 30 * NOISE * np.random.default_rng(1).standard_normal(other.tau.shape)
+    found = verdict(folder, replace(other, tau=noisy))
+    assert found["status"] == "usable"
+    assert "0.2 % on the fitted recordings" in found["reasons"][0]
 
 
 def test_the_weights_of_the_prior_of_a_result_are_those_of_its_logs(arm, here):
