@@ -42,17 +42,17 @@ SUSPECTED = [
     (dict(v=V * [1.0, -1.0]), "velocity_sign", "dq_b has the opposite sign of d(q)/dt of q_b. "
      "Negate one of them in the recording, or leave the dq columns out"),
     (dict(t=T * 1e3, v=None), "time_unit", "median step 10 looks like milliseconds (100 Hz); in "
-     'seconds it would be 0.1 Hz. State units time = "ms" (job file table [units], CLI --time-unit '
+     'seconds it would be 0.1 Hz. Set units time = "ms" (job file table [units], CLI --time-unit '
      'ms, Python units=LogUnits(time="ms")), or "s" if this is the unit. To convert it, multiply'),
     (dict(t=T * 200.0 / 10, v=None), "time_unit", "median step 0.2 looks like milliseconds (5000"),
     (dict(t=T * 1e6, v=None), "time_unit", "median step 10000 looks like microseconds (100 Hz)"),
     (dict(t=T * 1e9, v=None), "time_unit", "median step 1e+07 looks like nanoseconds (100 Hz)"),
     *[(dict(t=T * 1e-4, v=V * 1e4 * factor), "time_unit", f"dq_a is {factor:.3g} times d(q)/dt"
-       f"; the time looks like {name}seconds. State units time")
+       f"; the time looks like {name}seconds. Set units time")
       for factor, name in ((1e3, "milli"), (1e6, "micro"), (1e9, "nano"))],
     (dict(v=V / 1000), "time_unit", "dq_a is 0.001 times d(q)/dt. To read"),
     (dict(q=Q * [1.0, 90.0 / 0.3], v=None), "angle_unit", "q_b reaches 90, which looks like "
-     "degrees (in radians 14.3 revolutions). State units angle = "),
+     "degrees (in radians 14.3 revolutions). Set units angle = "),
     (dict(q=Q * [-2.1 * 2 * np.pi / np.abs(Q[:, 0]).max(), 1.0], v=None), "angle_unit",
      "q_a reaches 13.19, which looks like degrees (in radians 2.1 revolutions)"),
     (dict(q_ref=Q * 57.3 * 2), "angle_unit", "qref_a reaches 91."),
@@ -193,7 +193,7 @@ def test_a_command_in_degrees_is_told_from_one_that_goes_far_along_a_slider(fact
     for sign in (1.0, -1.0):  # a command that is reversed as well
         far = log(q=0.5 * Q, q_ref=0.5 * Q * [1.0, sign * factor], v=None)
         with pytest.raises(
-            DataError, match=rf"qref_b is {sign * factor:.3g} times that of q_b: one of them"
+            DataError, match=rf"qref_b is {sign * factor:.3g} times the motion of q_b: one looks"
         ):
             check_units(far, LogUnits(), prismatic=["a"])
     check_units(log(q=Q, q_ref=-Q, v=None), LogUnits())
@@ -206,7 +206,7 @@ def test_a_command_that_is_not_followed_shows_no_unit():
         other = share * (Q[:, 1] - Q[:, 1].mean()) + np.sqrt(1 - share**2) * y
         q_ref = np.column_stack([Q[:, 0], 180 / np.pi * 0.1 * other])
         check_units(log(q=0.1 * Q, q_ref=q_ref, v=None), LogUnits())
-    with pytest.raises(DataError, match=r"qref_b is 57\.3 times that of q_b"):
+    with pytest.raises(DataError, match=r"qref_b is 57\.3 times the motion of q_b"):
         check_units(log(q=0.1 * Q, q_ref=0.1 * Q * [1.0, 180 / np.pi], v=None), LogUnits())
 
 

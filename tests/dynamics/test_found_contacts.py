@@ -86,7 +86,7 @@ def test_what_cannot_be_found_names_what_to_log(robot):
     assert str(error.value).startswith(
         "log has no column of the contact of FL_FOOT, FR_FOOT, HL_FOOT, HR_FOOT, and the contact "
         "cannot be found from torques and motion: it has no torque or no motion of the base. "
-        "Record contact_FL_FOOT, 1 while the link touches the ground"
+        "Record contact_FL_FOOT (1 in contact, else 0)"
     )
     assert error.value.code == "missing_column"
     measured = replace(robot, constraints=[Contact(FEET[0], measured=("fz",))])

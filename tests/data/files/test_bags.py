@@ -118,7 +118,7 @@ def test_other_messages_are_passed_over_and_values_are_checked_as_in_any_log(tmp
         tmp_path / "part.mcap", [*messages_of(log), (t + 9, ["elbow"], q[:1], [], [])]
     )
     with pytest.raises(
-        DataError, match=r"1 of 61 messages lack .* \(message 60\) lacks position_s"
+        DataError, match=r"1 of 61 messages lack some, message 60 lacks position_shoulder"
     ):
         read_log(path, JOINTS)
     current = LogSource(effort="current")
@@ -434,7 +434,7 @@ def test_a_bag_without_odometry_names_what_is_missing(tmp_path):
         read_log(path, LEG, base=BASE)
     late = {"/odom": (ODOMETRY, S + 10.0, Maker.odometry)}
     path = write(tmp_path / "late", LEG_STATES | late)
-    with pytest.raises(DataError, match=r"no message of the joints lies between .*'/odom', 15.003"):
+    with pytest.raises(DataError, match=r"'/odom' has times 15.003 s to 15.403 s, the joints 5"):
         read_log(path, LEG, base=BASE)
     never = {"/odom": (ODOMETRY, S, lambda m, t: m.odometry(0.0))}
     path = write(tmp_path / "never", LEG_STATES | never)

@@ -360,7 +360,7 @@ def test_normalised_positions_are_no_angles(tmp_path):
         read_log(dataset(tmp_path), JOINTS, needs="commands")
     assert error.value.code == "angle_unit"
     assert str(error.value).startswith(
-        "arm: the unit of positions is not in the files of LeRobot. By version and use_degrees"
+        "arm: LeRobot's files lack the unit of positions: degrees, or normalised positions"
     )
 
 

@@ -534,8 +534,8 @@ def refused(text, kind=DataError):
     [
         (
             {"matrix": ((1.0, 1.0), (2.0, 2.0))},
-            "transmission of elbow, wrist: matrix [[1.0, 1.0], [2.0, 2.0]] is singular, so the "
-            "motor positions do not determine the joint positions. Each row is a motor",
+            "transmission of elbow, wrist: matrix [[1.0, 1.0], [2.0, 2.0]] is singular, expected "
+            "linearly independent rows, one for each motor",
         ),
         ({"matrix": (10.0, 0.0)}, "transmission of elbow, wrist: matrix [10.0, 0.0] is singular"),
         (
@@ -587,7 +587,7 @@ def test_gear_ratios_of_the_urdf_are_used_only_if_asked_for():
     assert stated.stated({"wrist": 9.0}) is stated
     with refused(
         "transmission: matrix is 'urdf', but the URDF has no <transmission> with a "
-        "<mechanicalReduction> only for elbow; it has one for wrist. State",
+        "<mechanicalReduction> only for elbow; it has one for wrist. Set",
         SettingsError,
     ):
         asked.stated({"wrist": 80.0})

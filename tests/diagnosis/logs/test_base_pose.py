@@ -192,7 +192,7 @@ def test_noise_of_the_pose_is_no_error_of_the_twist(free):
         ({"linear": 1e3}, ["linear", "if it is in mm/s: convert it to m/s"]),
         ({"angular": 180 / np.pi}, ["angular", "if it is in deg/s: convert it to rad/s"]),
         ({"turned": [slice(0, 3)]},
-         ["linear", "State twist = 'world' in [base], and turn the angular velocity"]),
+         ["linear", "Set twist = 'world' in [base], and turn the angular velocity"]),
     ],
 )  # fmt: skip
 def test_a_wrong_part_of_the_twist_is_named(free, change, words):
@@ -210,14 +210,14 @@ def test_a_twist_with_the_axes_of_the_world_is_found(free, part):
     assert not list(check_base(free, right, RAW))
     (found,) = check_base(free, wrong, RAW)
     assert (found.code, found.severity) == ("base_twist", "error")
-    assert "State twist = 'world' in [base]" in found.message
+    assert "Set twist = 'world' in [base]" in found.message
     assert found.evidence["off_world"] < 1e-3 * found.evidence["off"]
     off = np.sqrt(np.mean(np.sum((wrong.base.twist - twist)[:, part] ** 2, axis=1)))
     size = np.sqrt(np.mean(np.sum(twist[:, part] ** 2, axis=1)))
     assert [found.evidence[x] for x in ("off", "size")] == pytest.approx([off, size])
     unit, what = ("m/s", "linear") if part.start == 0 else ("rad/s", "angular")
-    words = f"{what} velocity of the base differs by {off:.2g} {unit} from that of its pose, "
-    assert f"{words}{size:.2g} {unit} (RMS)" in found.message
+    words = f"{what} velocity of the base differs by {off:.2g} {unit} (RMS) from the derivative of "
+    assert f"{words}its pose, {size:.2g} {unit};" in found.message
     other = next(check_base(free, changed(right, 2.0, 2.0), RAW))
     linear = np.sqrt(np.mean(np.sum(twist[:, :3] ** 2, axis=1)))  # m/s
     assert [other.evidence[x] for x in ("off", "size")] == pytest.approx([linear, linear])
@@ -230,7 +230,7 @@ def test_axes_of_the_world_are_named_though_the_base_hardly_turns(free):
     found = list(check_twist(both, SignalSettings(cutoff=20.0)))
     assert len(found) == 2
     for finding in found:
-        assert finding.message.endswith("State twist = 'world' in [base]")
+        assert finding.message.endswith("Set twist = 'world' in [base]")
         assert 0.05 < finding.evidence["off"] / finding.evidence["size"] < 0.3
 
 
@@ -240,7 +240,7 @@ def test_a_twist_that_was_turned_though_it_had_the_axes_of_the_base_is_named(fre
     wrong = replace(log, base=replace(log.base, twist=twist))
     found = list(check_twist(wrong, SignalSettings(cutoff=20.0)))
     assert len(found) == 2
-    assert all("State twist = 'base' in [base]" in x.message for x in found)
+    assert all("Set twist = 'base' in [base]" in x.message for x in found)
 
 
 def test_a_right_twist_shows_that_the_quaternion_is_the_inverse(free):
@@ -315,9 +315,9 @@ def scaled(angular, linear):
 
 FAULTS = {
     "axes": (lambda x: np.hstack([x[:, [1, 0, 2]], x[:, [4, 3, 5]]]) * ([1, -1, 1] * 2),
-             {"imu_axes": "are not those of the link", "imu_gravity": "deg from the vertical"}),
+             {"imu_axes": "from the axes of the link", "imu_gravity": "deg from the vertical"}),
     "gyroscope": (lambda x: np.hstack([x[:, [0, 2, 1]] * [-1, 1, 1], x[:, 3:]]),
-                  {"imu_axes": "are not those of the link"}),
+                  {"imu_axes": "from the axes of the link"}),
     "degrees": (scaled(180 / np.pi, 1.0), {"imu_axes": "it is in deg/s"}),
     "reversed": (scaled(1.0, -1.0), {"imu_gravity": "its sign is reversed"}),
     "g": (scaled(1.0, 1 / 9.81), {"imu_gravity": "it is in units of g"}),
@@ -454,7 +454,7 @@ def test_the_radius_of_a_rolling_foot_is_found(walker, ball):
     assert finding.code == "rolling_contact"
     assert finding.evidence["radius"] == pytest.approx(0.025, rel=0.02)
     assert finding.evidence["after"] < 0.1 * finding.evidence["before"]
-    assert "State radius = 0.025" in finding.message
+    assert "Set radius = 0.025" in finding.message
     (finding,) = found(0.01)
     assert finding.evidence["radius"] == pytest.approx(0.025, rel=0.02)
     assert not found(0.025)

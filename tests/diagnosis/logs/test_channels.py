@@ -332,7 +332,7 @@ def test_rate_and_jitter_are_those_of_the_steps():
     assert Figures(found["rate"]) == {
         "rate": pytest.approx(100.0), "samples": 901, "duration": pytest.approx(9.0)
     }  # fmt: skip
-    assert found["rate"].message.startswith("run.csv: 901 rows in 9 s, median rate 100 Hz")
+    assert found["rate"].message.startswith("run.csv: the log has 901 rows in 9 s, median rate 100")
     spread = np.sqrt(2.0 / 3.0) * 0.2
     assert Figures(found["jitter"]) == {
         "relative_spread": pytest.approx(spread),
@@ -351,7 +351,7 @@ def test_gaps_are_counted_and_the_longest_has_its_time():
     # before it, 300 steps of which one is a gap of 40 ms in place of 8
     at = START + 300 * 0.01 + 0.032
     assert Figures(gap) == {"gaps": 3, "longest": pytest.approx(0.5), "at": pytest.approx(at)}
-    assert gap.message.startswith("run.csv: 3 gaps, the longest of 0.5 s at t = 6.032 s")
+    assert gap.message.startswith("run.csv: the log has 3 gaps, the longest of 0.5 s at t = 6.032")
     # a gap has no part in the jitter
     assert found["jitter"].evidence["longest"] == pytest.approx(0.012)
     short = said(check_clock(clocked_log(stamps((100, 0.04)))))["gap"]
@@ -460,7 +460,7 @@ def test_joints_that_hardly_move_are_named_with_their_range_and_share(slider):
     assert (hardly.where, hardly.severity) == ("run.csv: arm_1_joint", "note")
     assert hardly.evidence["range"] == pytest.approx(0.15, abs=6e-4)
     assert hardly.evidence["moving_share"] == pytest.approx(300 / 1001)
-    assert "moving 30 % of the time" in hardly.message
+    assert "(range 0.15 rad, 30 % of the time)" in hardly.message
     # far, but in a twelfth of the time; and not at all
     found = said(check_rest(*moved(slider, (0, -2, 0.0), (400, 479, 1.0)), slider.layout))
     assert Figures(found["hardly_moves"]) == {
@@ -469,5 +469,5 @@ def test_joints_that_hardly_move_are_named_with_their_range_and_share(slider):
     still = found["static_joint"]
     assert (still.where, still.severity) == ("run.csv: torso_lift_joint", "warning")
     assert Figures(still) == {"range": 0.0, "moving_share": 0.0}
-    assert "torso_lift_joint at rest (range 0 m): this log" in still.message
-    assert "arm_1_joint (range 0.8 rad, moving 8 % of" in found["hardly_moves"].message
+    assert "torso_lift_joint did not move (range 0 m): this log" in still.message
+    assert "arm_1_joint moved little (range 0.8 rad, 8 %" in found["hardly_moves"].message

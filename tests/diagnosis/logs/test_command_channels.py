@@ -46,7 +46,7 @@ def test_forces_of_the_ground_identify_masses_without_torques_and_commands(log):
 def test_a_good_chirp_gives_notes_alone(log):
     note, loops = check_commands(log)
     assert (note.code, note.severity, note.where) == ("no_torque", "note", "log")
-    assert "as ratios to the gains of the controller" in note.message
+    assert "only relative to the controller's gains" in note.message
     assert (loops.code, loops.severity, loops.where) == ("loops", "note", "log")
     for servo, joint in zip(GOOD, log.joints, strict=True):
         # of exp(-s T) k / (s^2 + d s + k): phase T + d / k at rest, 0.707 at sqrt(k) for d = 1.4

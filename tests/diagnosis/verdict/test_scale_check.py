@@ -171,7 +171,7 @@ def test_a_factor_that_errors_of_the_urdf_explain_contradicts_nothing(common, is
     found = replace(far, common=common)
     assert (found.contradicts, found.has_one_factor) == (is_wrong, is_wrong)
     assert not found.agrees
-    said = "The factor common to the joints is 1.40 +- 0.5 (95 %), as the URDF's errors spread"
+    said = "The joints' common factor is 1.40 +- 0.5 (95 %): the URDF's errors may explain it"
     assert (said in found.message) is not is_wrong
     assert ("The same factor 1.50 fits all joints" in found.message) is is_wrong
     assert found.to_dict()["common"] == list(common)

@@ -63,7 +63,7 @@ def test_the_same_seed_draws_the_same_and_stated_values_stand(ur5):
 ERRORS = {
     "truth: values: 'elbow_joint.viscos' is not a parameter of ur5. Did you mean "
     "'elbow_joint.viscous'?": {"elbow_joint.viscos": 1.0},
-    "truth: body 'forearm_link' is physically inconsistent": {"forearm_link.m": 0.01},
+    "truth: body 'forearm_link': the smallest eigenvalue of its": {"forearm_link.m": 0.01},
     "truth: elbow_joint.viscous is -1 N m s/rad, expected 0 or more": {"elbow_joint.viscous": -1.0},
 }
 
@@ -76,5 +76,8 @@ def test_values_that_cannot_be_are_refused(ur5, rng, message):
 
 def test_a_urdf_that_cannot_be_is_no_start(tmp_path, rng):
     model = one_joint(tmp_path, inertia=-0.1)
-    with pytest.raises(ModelError, match=r"body 'body' of the URDF is phys.*robotid inspect"):
+    with pytest.raises(
+        ModelError,
+        match=r"body 'body' of the URDF: the smallest eigenvalue .* is -0.05, expected 0",
+    ):
         perturbed_bodies(model, 0.1, rng)

@@ -163,7 +163,7 @@ def test_without_gains_the_scale_is_said_to_rest_on_the_urdf(scaleless):
     assert not scaleless.has_stated_gains
     [scale] = [f for f in scaleless.findings if f.code == "scale"]
     assert scale.severity == "warning"
-    assert "state kp in [controller]" in scale.message
+    assert "set kp in [controller]" in scale.message
     assert scaleless.validation[0].baselines["urdf"] is None, "no open loop without gains"
 
 
@@ -263,7 +263,7 @@ def test_a_log_with_other_gains_is_named_with_their_ratio(leg, found):
     for one, ratio in zip(named.values(), ratios[1:], strict=True):
         assert abs(one.evidence["ratio"] / ratio - 1) < 0.15
         assert one.evidence["after"] < 0.3 * one.evidence["before"]
-        assert "times that of the fit: with other gains its position error is" in one.message
+        assert "times its value in the fit: with other gains its position error" in one.message
     assert not [one for one in loop_findings(found, ()) if one.code == "other_gains"]
 
 

@@ -166,7 +166,7 @@ def test_findings_of_the_fit_have_its_figures(found):
     )
     gains = said["gains_contradicted"]
     rail, turn = 1.234 * found.fit.loops.kp
-    assert "weight and inertia indicate gains of 1.23 +- 0.015 times those stated" in gains.message
+    assert "weight and inertia indicate gains of 1.23 +- 0.015 times the given" in gains.message
     assert f"of kp: rail = {rail:.3g}, turn = {turn:.3g}; kd" in gains.message
     assert gains.evidence == {"scale": pytest.approx(1.234), "std_error": 0.0152}
     friction = said["friction_found"]
