@@ -66,7 +66,7 @@ def main():
             victim = next(iter(client.run(os.getpid).values()))
             os.kill(victim, signal.SIGKILL)
             wait(folder / "two", 2 * units // 3, run)
-            others = max(client.run(peak).values())
+            others = max(client.run(peak, on_error="ignore").values())  # of those alive
             run.kill()
             run.wait()
         left = units - len(finished(folder / "two"))
