@@ -222,7 +222,7 @@ def _rows(unit: str, logs: Sequence[Path], result: Mapping[str, Any]) -> Iterato
     """Yield the rows of a result: base parameters of the unit, drive parameters of its logs."""
     verdict, between = result["verdict"], result.get("variation") or {"parameters": {}}
     common = {"unit": unit, "status": "done"}
-    of_unit = {"verdict": verdict["status"], "reasons": "; ".join(verdict["reasons"])}
+    of_unit = {"verdict": verdict["status"], "reasons": "\n".join(verdict["reasons"])}
     for entry in result["base_parameters"]:
         varied = between["parameters"].get(entry["name"])
         figures = {"value": entry["value"], "std_error": entry["std_error"]}
@@ -316,8 +316,8 @@ class _Gathered:
                 self._values[key].append((row["unit"], row["value"], row["std_error"]))
         judged = next((row for row in rows if row.get("verdict")), {})
         verdict, texts = judged.get("verdict", "failed"), [row.get("error") for row in rows]
-        first = judged.get("reasons", "").partition("; ")[0]  # the report has all
-        reason = "; ".join(filter(None, [*texts, first]))
+        first = judged.get("reasons", "").splitlines()[:1]  # the report has all
+        reason = "; ".join(filter(None, [*texts, *first]))
         unit = {"unit": rows[0]["unit"], "verdict": verdict, "reason": reason, "report": report}
         self._units.append(unit)
         self._verdicts.update([verdict] * bool(judged))

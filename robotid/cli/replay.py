@@ -65,7 +65,7 @@ class Findings:
         contents = [*(result.content for result in self.results.values()), self.track]
         settings = next(content["settings"] for content in contents if content)
         job = written_job(settings, "settings of the result")
-        parts = tuple(x for x in job.validation if x.path.name == Path(log).name)
+        parts = tuple(x for x in job.validation if x.path.resolve() == Path(log).resolve())
         fitted = (LogEntry(Path(log)),)
         return replace(job, urdf=Path(urdf), identification=fitted, validation=parts)
 
