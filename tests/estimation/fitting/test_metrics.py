@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from robotid.base.exceptions import DataError
-from robotid.estimation.fitting.evaluation import TorqueSums
+from robotid.estimation.fitting.evaluation import Metrics, TorqueSums
 
 TAU = np.array([[1.0, 10.0], [-1.0, 10.0], [3.0, 12.0], [0.0, 12.0]])
 
@@ -26,6 +26,7 @@ def test_metrics_are_what_their_names_say():
     assert b.r2 == 0.0  # its torque does not vary over the rows used
     assert not b.better_than_constant
     assert metrics.pooled_rmse == pytest.approx(np.sqrt((3 * 0.01 + 2 * 1.0) / 5))
+    assert Metrics.from_dict(metrics.to_dict()) == metrics
 
 
 def test_a_joint_without_rows_is_not_scored():

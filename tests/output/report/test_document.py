@@ -12,6 +12,7 @@ from robotid.output.report.motion_page import _collisions
 from robotid.output.report.next_steps import Origin
 from robotid.output.report.report_content import (
     Residual,
+    report_html,
     torque_report,
     worst_second,
     write_report,
@@ -149,6 +150,8 @@ def test_of_several_recordings_the_worst_counts(identified):
     assert next(iter(counted)) == joint
     found = {name: measured["relative_error_pct"] for name, measured in counted.items()}
     assert found == {**errors, joint: 99.0}
+    html = report_html(replace(identified, validation=(kept, second)), origin=ORIGIN)
+    assert html.count('<rect width="99.00%" height="9"/>') == 1  # the axis ends at 100 %
 
 
 def test_a_recording_that_was_fitted_is_none_that_was_predicted(identified):
