@@ -45,7 +45,7 @@ from robotid.cli.job import read_job
 from robotid.data.base_motion import BaseMotion
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.logs.base_checks import check_base
+from robotid.diagnosis.logs.base_checks import examine_base
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import compress
 from robotid.dynamics.prepared_logs import base_problem
@@ -314,7 +314,8 @@ def faults(name, seeds, duration):
         other = with_other_bodies(plant.model, of_urdf(seed))
         for label, change in POSES.items():
             wrong = replace(log, base=replace(log.base, pose=change(log.base.pose)))
-            codes = [x.code for x in check_base(other, wrong, signals) if x.severity == "error"]
+            findings, _ = examine_base(other, wrong, signals)
+            codes = [x.code for x in findings if x.severity == "error"]
             counts.setdefault(label, []).append("base_orientation" in codes)
     for label, own in counts.items():
         print(f"{name}, {label}: {sum(own)} of {len(own)} named", flush=True)

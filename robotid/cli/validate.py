@@ -211,10 +211,11 @@ def _verdict(
         )
         warnings.append(VerdictWarning("fitted_logs_missing", "", message))
     new = {e.recording.name: e.metrics["estimate"] for e in compress(evaluations, is_new)}
+    driven = tuple(x for x in model.joints if x not in model.passive)
     return judge(
         Predictions(
             Metrics.from_dict(result["identification"]), new,
-            tuple(x for x in model.joints if x not in model.passive),
+            driven if any(log.head.has_torque for log in logs) else (),
             refitted=[e.recording.name for e in compress(evaluations, np.logical_not(is_new))],
             hidden=hidden_joints(model, evaluations),
         ),

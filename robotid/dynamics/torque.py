@@ -75,13 +75,15 @@ def joint_torque_regressor(
 def trajectory_regressor(
     model: RobotModel, trajectory: Trajectory, samples: Array | None = None
 ) -> Array:
-    """Return the regressor of N samples of a trajectory, with stored inertial columns if any."""
+    """Return the regressor of N samples of a trajectory, (N n_rows, p); constrained: P W."""
     m = trajectory if samples is None else trajectory.at(samples)
-    if (stored := kept_rows(model, trajectory)) is None:
-        return joint_torque_regressor(model, m.q, m.v, m.a, m.direction, m.memory)
     Y = np.zeros((len(m.t), model.n_rows, len(model.layout.names)))
-    stored.write(slice(None) if samples is None else samples, Y)
+    if (stored := kept_rows(model, trajectory)) is None:
+        inertial_rows(model, m.q, m.v, m.a).write(slice(None), Y)
+    else:
+        stored.write(slice(None) if samples is None else samples, Y)
     _write_drives(model, (m.q, m.v, m.a), m.direction, m.memory, Y)
+    Y = Y if m.basis is None else without_forces(m.basis, Y)
     return Y.reshape(len(m.t) * model.n_rows, -1)
 
 

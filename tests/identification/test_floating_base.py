@@ -11,8 +11,9 @@ from helpers.replay_data import leave_out_meshes, shown
 import robotid
 from robotid.cli.replay import replay_identified
 from robotid.data.base_motion import BaseMotion
+from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.torque import predict
+from robotid.dynamics.torque import predict, trajectory_regressor
 from robotid.estimation.estimators import WLS
 from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.identification.repeated_errors import with_repeated_errors
@@ -98,6 +99,11 @@ def test_unseen_motion_is_predicted_judged_and_drawn_by_the_joints(found, monkey
     ratio = result.standard[masses].sum() / before[masses].sum()
     assert [check.scale, check.factor] == pytest.approx([ratio, ratio])
     assert check.is_total_determined
+    (one,), some = result.validation, np.arange(0, 400, 7)
+    W = trajectory_regressor(result.model, one.recording.trajectory, some)
+    np.testing.assert_allclose(
+        (W @ result.standard).reshape(-1, 18), one.torques["estimate"][some], atol=1e-9
+    )  # without the forces of contacts, so that bands are those of these errors
     leave_out_meshes(monkeypatch)
     other = replace(result, estimate=replace(result.estimate, sigma=np.arange(1.0, 19.0)))
     noise = shown(replay_identified(other).html)["torques"]["scale"]["of"]
@@ -177,3 +183,30 @@ def test_a_bias_of_the_accelerometers_is_estimated(go1, trot):
     np.testing.assert_allclose(with_repeated_errors(both).repeated.bias, bias, atol=0.015)
     again = with_repeated_errors(once).repeated  # of what is left: the whole bias is the same
     np.testing.assert_allclose(again.bias, once.repeated.bias, atol=0.4 * sure)
+
+
+FAULTS = {
+    "nothing": (lambda log: log, {}),
+    "sign of a leg, gain of a joint": (
+        lambda log: replace(log, tau=log.tau * [-1, -1, -1, *[1] * 5, 1.3, 1, 1, 1]),
+        {"torque_sign": "FL_hip FL_thigh FL_calf", "current_for_torque": "RL_calf"},
+    ),
+    "scale of a position": (
+        lambda log: replace(log, q=log.q * [*[1] * 5, 1.3, *[1] * 6]), {"angle_scale": "FR_calf"}
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_of_a_leg_is_found_at_its_joints(go1, trot, fault):
+    changed, wanted = FAULTS[fault]
+    log = changed(replace(trot[0], base=BaseMotion(trot[0].base.pose)).window(end=5.0))
+    other = with_other_bodies(go1, np.random.default_rng(7))
+    found = [x for x in diagnose(other, [log], [], SIGNALS) if x.severity != "note"]
+    named = {
+        code: " ".join(j.removesuffix("_joint") for x in found if x.code == code for j in x.joints)
+        for code in {x.code for x in found} - {"moving_contact"}
+    }
+    assert named == wanted
+    factors = [x.evidence["factor"] for x in found if "factor" in x.evidence]
+    np.testing.assert_allclose(factors, 1 / 1.3, rtol=0.1)

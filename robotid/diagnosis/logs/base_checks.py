@@ -52,18 +52,17 @@ _PARTS = {"linear": slice(0, 3), "angular": slice(3, 6)}  # of a twist
 _BACK = np.array([-1.0, -1.0, -1.0, 1.0])  # signs of the inverse quaternion
 
 
-def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator[Finding]:
-    """Yield findings on the base and the contacts of one log."""
+def examine_base(
+    model: RobotModel, log: Log, signals: SignalSettings
+) -> tuple[list[Finding], Trajectory | None]:
+    """Return findings on the base and contacts of one log, and its motion if that has no error."""
     imu = None if log.base is None else log.base.imu
     if wrong := list(check_unit(log)):
-        yield from wrong
-        return
-    if imu is None:
-        yield from check_pose(log)
-    twist = check_twist(log, signals)
+        return wrong, None
+    findings = [] if imu is not None else list(check_pose(log))
+    twist = list(check_twist(log, signals))
     if not model.contacts and imu is None:
-        yield from twist
-        return
+        return findings + twist, None
     still = replace(signals, velocity="differentiated", acceleration="differentiated")
     try:
         log = closed_log(model, log)
@@ -72,21 +71,20 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
         whole = log if wrong else with_contacts(model, log, signals)
         motion = process(whole, still)
     except DataError:  # too short, or no contacts: raised again when the log is read
-        yield from twist
-        return
-    yield from wrong or twist
+        return findings + twist, None
     if wrong:
-        return
-    for note in whole.notes[len(log.notes) :]:
-        yield finding("log_note", log.name, text=note)
+        return findings + wrong, None
+    findings += twist
+    findings += [finding("log_note", log.name, text=x) for x in whole.notes[len(log.notes) :]]
     wrong = [] if imu is None else list(check_imu(whole, motion))
-    yield from wrong
+    findings += wrong
     is_turned = any(one.code in ("imu_axes", "base_orientation") for one in wrong)
     if not model.contacts or is_turned:
-        return
+        return findings, None
     if not wrong:
-        yield from check_wrenches(model, log.name, motion)
-    yield from _check_feet(model, log, whole, motion)
+        findings += check_wrenches(model, log.name, motion)
+    findings += _check_feet(model, log, whole, motion)
+    return findings, process(whole, signals)
 
 
 def check_wrenches(model: RobotModel, log: str, motion: Trajectory) -> Iterator[Finding]:

@@ -21,7 +21,7 @@ from robotid.data.units import AT_REST, STILL
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import BETTER, NOTHING, SCATTERED, SEGMENTS
 from robotid.diagnosis.logs import channels
-from robotid.diagnosis.logs.base_checks import check_base
+from robotid.diagnosis.logs.base_checks import examine_base
 from robotid.diagnosis.logs.command_channels import check_commands
 from robotid.diagnosis.logs.probe import Probe, smooth_motion, take_probe
 from robotid.diagnosis.logs.torque_checks import (
@@ -59,7 +59,8 @@ def diagnose(
     _examine_torques(model, [one for one in examined if one.is_tried], signals)
     findings = [*assumed_inertials(model), *(x for one in examined for x in one.findings)]
     first = [one.motion for one in examined[: len(fitted)] if one.motion is not None]
-    probes = [one.probe for one in examined[: len(fitted)] if one.probe is not None]
+    known = [] if model.constraints else examined[: len(fitted)]
+    probes = [one.probe for one in known if one.probe is not None]
     mapping = structural_mapping(model) if probes else None
     for k, log in enumerate(fitted):
         same = [x.name for x in fitted[:k] if np.array_equal([x.q, x.tau], [log.q, log.tau])]
@@ -119,8 +120,13 @@ def _examine_log(model: RobotModel, log: Log, signals: SignalSettings) -> _Exami
         findings += channels.check_torque_channels(log.select(driven))
     one = _Examined(log, findings)
     if model.free_flyer or model.constraints or model.passive:
-        findings.append(finding("floating_base", name))
-        findings += check_base(model, log, signals)
+        of_base, motion = examine_base(model, log, signals)
+        findings += of_base
+        if model.loops or model.passive or motion is None:
+            findings.append(finding("floating_base", name))
+        elif log.has_torque:
+            one.probe = take_probe(model, motion)
+        one.is_tried = all(x.severity != "error" for x in findings)
         return one
     if model.is_static:
         return one  # the other checks need accelerations
@@ -158,7 +164,8 @@ def _examine_torques(model: RobotModel, logs: Sequence[_Examined], signals: Sign
         others = [x for x in torques if x.severity == "error" and x.code not in _OF_A_DRIVE]
         moved = {joint for x in others for joint in x.joints}
         coarse = {joint for x in one.findings if x.code == "quantised" for joint in x.joints}
-        off = [x for x in _drives_off(check.probe, coarse, name) if moved.isdisjoint(x.joints)]
+        off = [] if model.constraints else _drives_off(check.probe, coarse, name)
+        off = [x for x in off if moved.isdisjoint(x.joints)]
         beyond = [x for x in one.findings if x.code in _BEYOND]
         one.findings[:] = [x for x in one.findings if x not in beyond or moved.isdisjoint(x.joints)]
         errors = [x for x in (*beyond, *off) if x.severity == "error"]
@@ -169,7 +176,7 @@ def _examine_torques(model: RobotModel, logs: Sequence[_Examined], signals: Sign
             if not (named.issuperset(x.joints) and x.code in (_OF_A_DRIVE if x.joints else of_all))
         ]  # fmt: skip
         one.findings += [*off, *torques]
-        if not any(x.severity == "error" for x in torques):
+        if not (model.constraints or any(x.severity == "error" for x in torques)):
             one.findings += check_torque_delay(model, one.log, signals, name)
 
 

@@ -10,6 +10,7 @@ from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process, resolve, unwrap
 from robotid.data.units import AT_REST
+from robotid.dynamics.constraint_rows import constraint_jacobian, measured_rows, touching
 from robotid.dynamics.rows import drive_values, friction_directions, friction_speeds, inertial_rows
 from robotid.robot.model import RobotModel
 
@@ -30,12 +31,22 @@ class Probe:
     v: Array  # (N, n), velocities
     a: Array  # (N, n), accelerations
     tau: Array  # (N, n), torques [N m or N]
+    contacts: Array | None = None  # (N, k), those that may touch the ground; None without any
+    forces: Array | None = None  # (N, n), torques of measured forces
 
     @classmethod
     def of(cls, model: RobotModel, motion: Trajectory, rows: Array) -> "Probe":
         """Return the probe at rows of a motion."""
         at = (x[rows] for x in (motion.q, motion.v, motion.a, motion.tau))
-        return cls(model, motion, rows, *at)
+        probe = cls(model, motion, rows, *at)
+        if not model.constraints:
+            return probe
+        contacts = touching(model, motion)[rows]
+        forces = np.zeros(probe.tau.shape)
+        if motion.wrenches is not None:
+            J = constraint_jacobian(model, probe.q, contacts)[:, measured_rows(model)]
+            forces = np.einsum("kmj,km->kj", J, motion.wrenches[rows])
+        return replace(probe, contacts=contacts, forces=forces)
 
     @cached_property
     def _places(self) -> tuple[Array, Array]:
@@ -102,7 +113,9 @@ def take_probe(model: RobotModel, motion: Trajectory, *, samples: int = 500) -> 
     parts = np.split(motion.t, np.flatnonzero(np.diff(motion.segment)) + 1)
     inner = np.concatenate([(t >= t[0] + _MARGIN) & (t <= t[-1] - _MARGIN) for t in parts])
     slow = AT_REST * model.layout.drive_speeds[: len(model.joints)]
-    rows = np.flatnonzero((np.abs(motion.v) > slow).any(axis=1) & inner)
+    moves = (np.abs(motion.v[:, -len(slow) :]) > slow).any(axis=1)
+    is_smooth = inner if motion.switching is None else inner & ~motion.switching
+    rows = np.flatnonzero(moves & is_smooth)
     if len(rows) < 50:
         return None
     chosen = np.unique(np.linspace(0, len(rows) - 1, samples).astype(int))

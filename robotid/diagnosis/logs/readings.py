@@ -21,6 +21,12 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.diagnosis.logs.channels import ZERO
 from robotid.diagnosis.logs.probe import Probe, drive_columns
+from robotid.dynamics.constraint_rows import (
+    constraint_jacobian,
+    force_basis,
+    measured_rows,
+    without_forces,
+)
 from robotid.dynamics.rows import inertial_rows, joint_constants
 from robotid.robot.model import GRAVITY, RobotModel
 from robotid.robot.prior import prior_spread
@@ -43,15 +49,24 @@ _DRIVE = 4  # columns of a drive: offset, armature, viscous and Coulomb friction
 
 def limbs(model: RobotModel) -> list[tuple[Array, bool]]:
     """Return groups of joints that are explained together, and whether other readings are tried."""
-    # Those that carry few bodies, connected by these bodies; last those that carry more.
+    # Those that carry few bodies, connected by these bodies; last those that carry more. Forces of
+    # contacts connect all joints.
+    joints = np.arange(model.n_rows - len(model.joints), model.n_rows)
+    carries = model.support[:, : model.layout.n_inertial : 10]
+    if model.constraints:
+        return [(joints, carries.shape[1] <= _BODIES)]
+    is_few = carries[joints].sum(axis=1) <= _BODIES
+    groups = [(branch, True) for branch in _branches(model, joints[is_few])]
+    return groups + ([] if is_few.all() else [(joints[~is_few], False)])
+
+
+def _branches(model: RobotModel, joints: Array) -> list[Array]:
+    """Return groups of joints that carry a body together, as of each leg."""
     from scipy.sparse.csgraph import connected_components
 
-    carries = model.support[:, : model.layout.n_inertial : 10]
-    is_few = carries.sum(axis=1) <= _BODIES
-    small = np.flatnonzero(is_few)
-    count, label = connected_components(carries[small] @ carries[small].T)
-    groups = [(small[label == k], True) for k in range(count)]
-    return groups + ([] if is_few.all() else [(np.flatnonzero(~is_few), False)])
+    carries = model.support[joints, : model.layout.n_inertial : 10]
+    count, label = connected_components(carries @ carries.T)
+    return [joints[label == k] for k in range(count)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +74,7 @@ class _Motion:
     """N instants of a motion and torque columns, and what a robot predicts of a limb's joints."""
 
     model: RobotModel
-    q: Array  # (N, n) [rad or m]
+    q: Array  # (N, n) [rad or m]; of a floating base (N, 1 + n), with n rows, 6 of them of the base
     v: Array  # (N, n)
     a: Array  # (N, n)
     tau: Array  # (N, n) [N m or N], columns as logged
@@ -71,40 +86,73 @@ class _Motion:
     clock: float = 1.0  # speed of the time stamps
     subtracted: float = 0.0  # factor of the URDF's gravity that was subtracted from the torques
     segments: int = _SEGMENTS  # of the instants
+    contacts: Array | None = None  # (N, k), those that may touch the ground; None without any
+    forces: Array | None = None  # (N, n) [N m or N], torques of measured forces
 
     @cached_property
     def products(self) -> Array:
         """P^T P of each segment and joint: P = [bodies, drive, URDF's torque, columns of tau]."""
+        # Rows without unknown forces of contacts contain the drives of all joints.
         X, pi = self.inertial(), self.model.standard_parameters()[self.moved]
-        urdf = X @ pi
+        urdf, reach, rows, (N, n) = X @ pi, self.reach, self.rows, self.tau.shape
         is_changed = (self.gravity != 1.0).any() or (self.inertia != 1.0).any()
         if is_changed or self.subtracted:
             weight = replace(self, clock=0.0).inertial()
-            gravity, inertia = (x[self.rows, None] for x in (self.gravity, self.inertia))
+            gravity, inertia = (x[reach, None] for x in (self.gravity, self.inertia))
             X = inertia * (X - weight) + gravity * weight
             urdf = X @ pi - self.subtracted * (weight @ pi)
-        drive = drive_columns(self.model, self.q, self.v, self.a)[:, self.rows]
+        joints = np.arange(n - len(self.model.joints), n)
+        every = drive_columns(self.model, self.q, self.v[:, joints], self.a[:, joints])
+        drive = np.zeros((N, n, every.shape[2]))
+        drive[:, joints] = every
+        coupled, drive = drive[:, reach, _DRIVE:], drive[:, rows, :_DRIVE]
         level = np.sqrt(np.mean(self.tau**2, axis=0).max())
         drive *= level / (np.sqrt(np.mean(drive**2, axis=0)) + _FLOOR)
-        coupled, drive = drive[..., _DRIVE:], drive[..., :_DRIVE]
-        logged = np.repeat(self.tau[:, None], len(self.rows), axis=1)
         bodies = (X * self.spread[self.moved])[..., self.spread[self.moved] > 0.0]
-        P = np.concatenate([bodies, coupled, drive, urdf[..., None], logged], axis=2).swapaxes(0, 1)
-        edges = np.linspace(0, len(self.tau), self.segments + 1).astype(int).tolist()
+        logged = np.repeat(self.tau[:, None], len(rows), axis=1)
+        if self.basis is not None:
+            own = np.zeros((N, _DRIVE, len(rows), n))
+            own[:, :, np.arange(len(rows)), rows] = drive.swapaxes(1, 2)
+            drive = own.reshape(N, -1, n).swapaxes(1, 2)
+            urdf, logged = urdf - self.forces, self.tau[:, None] * np.eye(n)
+        P = np.concatenate([bodies, coupled, drive, urdf[..., None], logged], axis=2)
+        P = (P if self.basis is None else without_forces(self.basis, P)[:, rows]).swapaxes(0, 1)
+        edges = np.linspace(0, N, self.segments + 1).astype(int).tolist()
         parts = [P[:, i:k] for i, k in pairwise(edges)]
         return np.array([part.swapaxes(1, 2) @ part for part in parts])  # (K, m, c, c)
 
     @cached_property
+    def basis(self) -> Array | None:
+        """Basis of the torques of unknown forces of contacts; None without contacts."""
+        if self.contacts is None:
+            return None
+        J = constraint_jacobian(self.model, self.q, self.contacts)
+        J = np.delete(J, measured_rows(self.model), axis=1)
+        return force_basis(J, np.ones(self.v.shape, dtype=bool))
+
+    @property
+    def variation(self) -> Array:
+        """Squared variation of each torque, without unknown forces, (n,); 0 if constant."""
+        tau = self.tau if self.basis is None else without_forces(self.basis, self.tau)
+        squares = np.sum((tau - tau.mean(axis=0)) ** 2, axis=0)
+        return np.where(squares > _FLOOR**2 * np.sum(self.tau**2, axis=0), squares, 0.0)
+
+    @cached_property
+    def reach(self) -> Array:
+        """The limb's joints, or all rows if forces of contacts connect them."""
+        return self.rows if self.contacts is None else np.arange(self.tau.shape[1])
+
+    @cached_property
     def moved(self) -> Array:
         """Places of the parameters of bodies that the limb moves."""
-        moves = self.model.support[self.rows, : len(self.spread)]
+        moves = self.model.support[self.reach, : len(self.spread)]
         return np.flatnonzero(moves.any(axis=0))
 
     def inertial(self) -> Array:
         """Return the columns of the limb's bodies, shape (N, m, p)."""
         every = inertial_rows(self.model, self.q, self.clock * self.v, self.clock**2 * self.a)
-        X = np.zeros((len(self.q), len(self.rows), len(self.spread)))
-        for k, j in enumerate(self.rows):
+        X = np.zeros((len(self.q), len(self.reach), len(self.spread)))
+        for k, j in enumerate(self.reach):
             X[:, k, every.columns[j]] = every.values[every.first[j] : every.first[j + 1]].T
         return X[..., self.moved]
 
@@ -119,20 +167,24 @@ class Samples:
     gain: Array  # (n,), torque as logged over the torque of the joint
 
     @classmethod
-    def of(cls, probe: Probe, rows: Array) -> "Samples":
-        """Return the samples of a log as it is."""
+    def of(cls, probe: Probe, rows: Array, moves: Array) -> "Samples":
+        """Return the samples of a log as it is; torques of joints that do not move count as 0."""
         one, model = np.ones(probe.tau.shape[1]), probe.model
         spread = prior_spread(model, np.ones((3, model.n_rows)), 1)[: model.layout.n_inertial]
-        at = probe.q, probe.v, probe.a, probe.tau, _variation(probe.tau)
+        at = probe.q, probe.v, probe.a, probe.tau, one
         motion = _Motion(model, *at, rows, _LOOSE * spread, one, one)
+        motion = replace(motion, contacts=probe.contacts, forces=probe.forces)
+        motion = replace(motion, size=moves * motion.variation)
         return cls(motion, np.arange(len(one)), one, one)
 
     def few(self) -> "Samples":
         """Return some of the instants, in one segment, with bodies nearer the URDF's."""
         step = max(1, len(self.motion.q) // _FEW)
-        some = {key: getattr(self.motion, key)[::step] for key in ("q", "v", "a", "tau")}
-        spread = self.motion.spread / _LOOSE
-        return self.changed(segments=1, size=_variation(some["tau"]), spread=spread, **some)
+        channels = ("q", "v", "a", "tau", "contacts", "forces")
+        known = {key: getattr(self.motion, key) for key in channels}
+        some = {key: x if x is None else x[::step] for key, x in known.items()}
+        few = self.changed(segments=1, spread=self.motion.spread / _LOOSE, **some)
+        return few.changed(size=(self.motion.size > 0.0) * few.motion.variation)
 
     def changed(self, **values: Any) -> "Samples":  # noqa: ANN401
         """Return the samples with other values of the motion or of the robot."""
@@ -142,6 +194,8 @@ class Samples:
     def unsigned(self) -> tuple[int, ...]:
         """The joints of the limb with torques that vary and are never negative."""
         m = self.motion
+        if m.basis is not None:  # a leg that stands has torques of one sign
+            return ()
         low, high = m.tau.min(axis=0), m.tau.max(axis=0)
         is_unsigned = (m.size > 0.0) & (low >= -ZERO * high)
         return tuple(j for j in m.rows.tolist() if is_unsigned[self.order[j]])
@@ -150,32 +204,37 @@ class Samples:
     def _problem(self) -> tuple[Array, Array]:
         """Products of columns and torque of each segment and joint, and the variation (m,)."""
         m, rows = self.motion, self.motion.rows
-        G, j = m.products, np.arange(len(rows))
+        G, k = m.products, np.arange(len(rows))
         c = G.shape[-1] - m.tau.shape[1] - 1  # place of the URDF's torque
-        tau = c + 1 + self.order[rows]
-        gain, sign = self.gain[rows, None], self.sign[rows, None]
-        scale = np.repeat(gain, c, axis=1)
-        scale[:, c - _DRIVE :] = 1.0
-        b = sign * G[:, j, :, tau].swapaxes(0, 1) - gain * G[:, :, :, c]  # (K, m, C)
-        square = sign[:, 0] * b[:, j, tau] - gain[:, 0] * b[:, j, c]
+        gain = self.gain[rows]
+        read = np.zeros((len(rows), m.tau.shape[1] + 1))  # factors of it and of torque columns
+        scale = np.ones((len(rows), c))
+        if m.basis is None:
+            read[k, 1 + self.order[rows]] = self.sign[rows] / gain
+            scale[:, c - _DRIVE :] /= gain[:, None]
+        else:
+            read[:, 1 + rows] = self.sign[rows] / gain
+            scale[:, c - _DRIVE * len(rows) :] /= np.tile(gain, _DRIVE)
+        read[:, 0] = -1.0
+        b = G[..., c:] @ read[..., None]  # (K, m, C, 1)
         made = np.empty((*G.shape[:2], c + 1, c + 1))
         made[..., :c, :c] = scale[:, :, None] * scale[:, None] * G[..., :c, :c]
-        made[..., :c, c] = made[..., c, :c] = scale * b[..., :c]
-        made[..., c, c] = square
-        return made, m.size[self.order[rows]]
+        made[..., :c, c] = made[..., c, :c] = scale * b[..., :c, 0]
+        made[..., c, c] = (read[:, None] @ b[..., c:, :])[..., 0, 0]
+        return made, m.size[self.order[rows]] / gain**2
 
     @cached_property
     def share(self) -> Array:
         """Unexplained share of each torque of the limb, fitted to all instants, (m,)."""
         products, size = self._problem
         whole = products.sum(axis=0)
-        return _over(_left(whole, _fitted(whole, size, len(self.motion.q))), size)
+        return _over(_left(whole, _fitted(self.motion, whole, size)), size)
 
     def gain_without(self, joints: tuple[int, ...]) -> float:
         """Return the gain of the torques of some joints that the other joints predict."""
         products, size = self._problem
         rows, at = self.motion.rows, np.isin(self.motion.rows, joints) & (size > 0.0)
-        x = _fitted(products.sum(axis=0), np.where(at, 0.0, size), len(self.motion.q))
+        x = _fitted(self.motion, products.sum(axis=0), np.where(at, 0.0, size))
         # tau = gain (X x + X pi) + drives, by the products of these columns
         G, c = self.motion.products.sum(axis=0), x.shape[1]
         squares = np.zeros((1 + _DRIVE * int(at.sum()),) * 2)
@@ -197,20 +256,14 @@ class Samples:
         products, size = self._problem
         whole, left = products.sum(axis=0), np.zeros(len(size))
         for segment in products:
-            left += _left(segment, _fitted(whole - segment, size, len(self.motion.q)))
+            left += _left(segment, _fitted(self.motion, whole - segment, size))
         return _over(left, size)
 
     @property
     def unexplained(self) -> Array:
         """The same share of torques with their signs, at most 1, (m,)."""
         m, own = self.motion, self.order[self.motion.rows]
-        return np.minimum(_over(self.held_out * m.size[own], _variation(m.tau)[own]), 1.0)
-
-
-def _variation(tau: Array) -> Array:
-    """Return the sum of squares of torques (N, n) about their mean, (n,), 0 if constant."""
-    squares = np.sum((tau - tau.mean(axis=0)) ** 2, axis=0)
-    return np.where(squares > _FLOOR**2 * np.sum(tau**2, axis=0), squares, 0.0)
+        return np.minimum(_over(self.held_out * m.size[own], m.variation[own]), 1.0)
 
 
 def misfit(share: Array) -> float:
@@ -228,27 +281,32 @@ def _left(products: Array, x: Array) -> Array:
     return np.asarray(np.maximum((x @ products @ x.swapaxes(1, 2))[:, 0, 0], 0.0))
 
 
-def _fitted(products: Array, size: Array, count: int) -> Array:
-    """Return parameters of the bodies, near 0, and of each drive, none negative, shape (m, c)."""
+def _fitted(motion: _Motion, products: Array, size: Array) -> Array:
+    """Return parameters of the bodies, near 0, and of the drives, none negative, shape (m, c)."""
     # The noise of each joint in the second fit is the residual of the first.
     from scipy.linalg.lapack import dpotrf, dtrtrs
     from scipy.optimize import nnls
 
     m, c = len(products), products.shape[1] - 1
-    p = c - _DRIVE
+    is_projected = motion.basis is not None  # each row has the drives of all joints
+    p = c - _DRIVE * (m if is_projected else 1)
     offset, first = p + np.arange(m), p + m
     friction = first + np.arange((_DRIVE - 1) * m).reshape(m, -1)
     own = np.column_stack([offset, friction])  # (m, 4)
-    every = np.column_stack([np.tile(np.arange(p), (m, 1)), own])
+    every = np.tile(np.arange(c), (m, 1))  # places of the columns of each row
+    every = every if is_projected else np.column_stack([every[:, :p], own])
     noise, x = EXPLAINED * size, np.zeros((m, c))
     A, b = np.zeros((p + _DRIVE * m,) * 2), np.zeros(p + _DRIVE * m)
     for _ in range(2):
-        weight = count / np.where(size > 0.0, noise + _FLOOR * size, np.inf)
+        weight = len(motion.q) / np.where(size > 0.0, noise + _FLOOR * size, np.inf)
         weighted = weight[:, None, None] * products
-        A[:p, :p] = weighted[:, :p, :p].sum(axis=0)
-        A[own, :p] = weighted[:, p:c, :p]
-        A[own[:, :, None], own[:, None]] = weighted[:, p:c, p:c]
-        b[:p], b[own] = weighted[:, :p, c].sum(axis=0), weighted[:, p:c, c]
+        if is_projected:
+            A[:], b[:] = weighted[:, :c, :c].sum(axis=0), weighted[:, :c, c].sum(axis=0)
+        else:
+            A[:p, :p] = weighted[:, :p, :p].sum(axis=0)
+            A[own, :p] = weighted[:, p:c, :p]
+            A[own[:, :, None], own[:, None]] = weighted[:, p:c, p:c]
+            b[:p], b[own] = weighted[:, :p, c].sum(axis=0), weighted[:, p:c, c]
         diagonal = np.diagonal(A).copy()
         np.fill_diagonal(A, (1.0 + _FLOOR**2) * diagonal + 1.0)
         L = dpotrf(A, lower=True)[0]
@@ -275,6 +333,17 @@ class Reading:
         """Return samples so read."""
         return self.apply(samples, *self.values)
 
+    def started(self, samples: Samples) -> Iterator["Reading"]:
+        """Yield the reading of one value at which parabolas through three shares are low."""
+        low, high = (self.apply(samples, x).share for x in (-self.step, self.step))
+        before, slope = samples.share, 0.5 * (high - low)
+        curvature, weight = 0.5 * (high + low) - before, 1.0 / (before + _FLOOR)
+        least = weight @ curvature
+        x = float(-0.5 * (weight @ slope) / least if least > 0.0 else -np.sign(weight @ slope))
+        lowest = np.maximum(before + slope * x + curvature * x**2, 0.0)
+        if misfit(before) - misfit(lowest) > _ALIKE:
+            yield replace(self, values=(self.step * x,))
+
     def refined(self, samples: Samples, most: int) -> "Reading":
         """Return the reading with the values that explain the torques best."""
         from scipy.optimize import minimize
@@ -295,9 +364,10 @@ class Reading:
 def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
     """Yield the readings that are tried, general ones before special ones."""
     m, model = samples.motion, samples.motion.model
-    n, rows, every = len(model.joints), m.rows.tolist(), tuple[int, ...]()
-    turning = [j for j in rows if model.joints[j] not in model.layout.prismatic]
-    one, g = np.eye(n), np.array(model.pin_model.gravity.linear)
+    n, rows, every = model.n_rows, m.rows.tolist(), tuple[int, ...]()
+    turning = [j for j in rows if model.row_names[j] not in model.layout.prismatic]
+    one, place = np.eye(n), np.eye(m.q.shape[1])[-n:]  # of a row, and of its position
+    g = np.array(model.pin_model.gravity.linear)
     up = -g / (float(np.linalg.norm(g)) or 1.0)
     yield Reading("torque_sign", every, partial(_negated, on=np.ones(n)))
     axes = [sign * axis for axis in np.eye(3) for sign in (1, -1)]
@@ -313,31 +383,42 @@ def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
             yield Reading("gravity_compensated", (j,), partial(_weightless, on=one[j]))
     for speed in (0.1, 0.5, 2.0, 10.0):
         yield Reading("time_scale", every, _timed, (float(np.log(speed)),), 0.3)
-    for i, k in combinations(rows, 2):
-        order = np.arange(n)
-        order[[i, k]] = k, i
-        yield Reading("torque_order", (i, k), partial(_reordered, order=order))
-        yield Reading("position_order", (i, k), partial(_exchanged, i=i, k=k))
-        yield Reading(
-            "joint_order", (i, k), lambda s, i=i, k=k, o=order: _reordered(_exchanged(s, i, k), o)
-        )
-    for j in rows:
-        yield Reading("torque_sign", (j,), partial(_negated, on=one[j]))
-        yield Reading("joint_axis", (j,), lambda s, j=j: _negated(_mirrored(s, j), one[j]))
+    branches, singles = [tuple(x.tolist()) for x in _branches(model, m.rows)], [(j,) for j in rows]
+    legs = branches if len(branches) > 1 else []
+    for i, k in combinations((legs if is_gross else ()) if legs else singles, 2):
+        if len(i) == len(k):
+            moved = np.arange(n)
+            moved[[*i, *k]] = *k, *i
+            order = tuple(moved.tolist())
+            yield Reading("torque_order", i + k, partial(_reordered, order=order))
+            yield Reading("position_order", i + k, partial(_exchanged, order=order))
+            yield Reading("joint_order", i + k, lambda s, o=order: _reordered(_exchanged(s, o), o))
+    for group in [*singles, *legs]:
+        yield Reading("torque_sign", group, partial(_negated, on=one[list(group)].sum(axis=0)))
+    for j in rows if is_gross or not legs else ():
+        yield Reading("joint_axis", (j,), lambda s, j=j: _negated(_multiplied(s, -2.0, j), one[j]))
         if j in turning:
-            yield Reading("position_sign", (j,), partial(_mirrored, j=j))
+            yield Reading("position_sign", (j,), partial(_multiplied, more=-2.0, j=j))
     for group in (samples.unsigned, *zip(samples.unsigned, strict=True)):
         yield Reading("unsigned_torque", group, partial(_signed, joints=group))
-    wrists = (tuple(rows[first:]) for first in range(1, len(rows) - 1))
-    for group in [tuple(rows), *zip(rows, strict=True), *wrists]:
-        gain = samples.gain_without(group)
-        if gain > 0.0:
-            scaled = partial(_scaled, on=one[list(group)].sum(axis=0))
-            named = group if len(group) < len(rows) else every  # another unit
+    wrists = [tuple(rows[first:]) for first in range(1, len(rows) - 1)]
+    for group in [tuple(rows), *singles, *(legs or wrists)]:
+        scaled = partial(_scaled, on=one[list(group)].sum(axis=0))
+        named = group if len(group) < len(rows) else every  # another unit
+        if m.basis is not None:
+            yield from Reading("current_for_torque", named, scaled, (), 0.3).started(samples)
+        elif (gain := samples.gain_without(group)) > 0.0:
             yield Reading("current_for_torque", named, scaled, (float(np.log(gain)),), 0.3)
     for j in turning:
-        for offset in (np.pi / 2, -np.pi / 2, np.pi, _OFFSET, -_OFFSET):
-            yield Reading("position_offset", (j,), partial(_shifted, on=one[j]), (offset,), 0.1)
+        shifted = Reading("position_offset", (j,), partial(_shifted, on=place[j]), (), 0.1)
+        if m.basis is not None:
+            yield from shifted.started(samples)
+            yield from Reading("angle_scale", (j,), partial(_multiplied, j=j), (), 0.1).started(
+                samples
+            )
+        else:
+            for offset in (np.pi / 2, -np.pi / 2, np.pi, _OFFSET, -_OFFSET):
+                yield replace(shifted, values=(offset,))
     for j in turning if is_gross else ():
         for turn in _quarters(model, j):
             yield Reading("axis_direction", (j,), partial(_turned, j=j, turn=turn))
@@ -370,35 +451,42 @@ def _shifted(samples: Samples, offset: float, on: Array) -> Samples:
     return samples.changed(q=samples.motion.q - offset * on)
 
 
-def _reordered(samples: Samples, order: Array) -> Samples:
-    return replace(samples, order=samples.order[order], sign=samples.sign[order])
+def _reordered(samples: Samples, order: tuple[int, ...]) -> Samples:
+    if samples.motion.basis is not None:  # columns of all joints enter each row
+        return samples.changed(tau=samples.motion.tau[:, order])
+    at = list(order)
+    return replace(samples, order=samples.order[at], sign=samples.sign[at])
 
 
 @lru_cache(maxsize=1)  # for two readings
-def _exchanged(samples: Samples, i: int, k: int) -> Samples:
-    """Return the samples with the positions of two joints exchanged."""
-    order = np.arange(samples.motion.q.shape[1])
-    order[[i, k]] = k, i
-    q, v, a = (x[:, order] for x in (samples.motion.q, samples.motion.v, samples.motion.a))
-    return samples.changed(q=q, v=v, a=a)
+def _exchanged(samples: Samples, order: tuple[int, ...]) -> Samples:
+    """Return the samples with the positions of joints in another order."""
+    return _moved(samples, lambda x: x[:, order])
 
 
 @lru_cache(maxsize=1)  # for two readings
-def _mirrored(samples: Samples, j: int) -> Samples:
-    """Return the samples with the position of a joint negated."""
-    sign = np.where(np.arange(samples.motion.q.shape[1]) == j, -1.0, 1.0)
-    q, v, a = (sign * x for x in (samples.motion.q, samples.motion.v, samples.motion.a))
-    return samples.changed(q=q, v=v, a=a)
+def _multiplied(samples: Samples, more: float, j: int) -> Samples:
+    """Return the samples with the motion of a joint multiplied by 1 + more."""
+    factor = 1.0 + more * (np.arange(samples.motion.v.shape[1]) == j)
+    return _moved(samples, lambda x: factor * x)
+
+
+def _moved(samples: Samples, change: Callable[[Array], Array]) -> Samples:
+    """Return the samples with another motion of the joints: positions as the rows are numbered."""
+    m = samples.motion
+    extra = m.q.shape[1] - m.v.shape[1]  # of the pose of a floating base
+    q = np.hstack([m.q[:, :extra], change(m.q[:, extra:])])
+    return samples.changed(q=q, v=change(m.v), a=change(m.a))
 
 
 def _turned(samples: Samples, j: int, turn: tuple[Array, bool]) -> Samples:
     model = samples.motion.model
-    return samples.changed(model=model.with_turned_axis(model.joints[j], *turn))
+    return samples.changed(model=model.with_turned_axis(model.row_names[j], *turn))
 
 
 def _quarters(model: RobotModel, j: int) -> Iterator[tuple[Array, bool]]:
     """Yield turns of a joint's axis by a quarter, and whether what it carries turns with it."""
-    axis = joint_constants(model.pin_model, model.pin_model.getJointId(model.joints[j]))[-3:]
+    axis = joint_constants(model.pin_model, model.pin_model.getJointId(model.row_names[j]))[-3:]
     for about, quarter, is_carried in product(np.eye(3), (1, -1), (False, True)):
         if abs(about @ axis) < 0.5:
             rotation = np.outer(about, about) + quarter * np.cross(about, np.eye(3))

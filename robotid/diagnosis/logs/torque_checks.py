@@ -52,9 +52,10 @@ class TorqueCheck:
     def of(cls, probe: Probe) -> "TorqueCheck":
         """Return the check of a log."""
         # the friction of a joint at rest has any value: nothing contradicts its torque
-        moves = np.ptp(probe.motion.q, axis=0) >= STATIC
-        groups = [(rows[moves[rows]], is_tried) for rows, is_tried in limbs(probe.model)]
-        samples = tuple((Samples.of(probe, rows), x) for rows, x in groups if len(rows))
+        moves = np.ptp(probe.motion.q[:, -probe.tau.shape[1] :], axis=0) >= STATIC
+        used = moves | bool(probe.model.constraints)  # forces of contacts connect all joints
+        groups = [(rows[used[rows]], is_tried) for rows, is_tried in limbs(probe.model)]
+        samples = tuple((Samples.of(probe, rows, moves), x) for rows, x in groups if len(rows))
         share = np.ones(len(moves))
         for one, _ in samples:
             share[one.motion.rows] = np.minimum(one.share, 1.0)
@@ -68,18 +69,20 @@ class TorqueCheck:
 
     def loads(self, name: str) -> Iterator[Finding]:
         """Yield another scale, a load or another robot, and torques that nothing explains."""
-        yield from _check_loads(self.probe, self.share, name)
+        model = self.probe.model
+        if not model.constraints:
+            yield from _check_loads(self.probe, self.share, name)
         moving = [j for samples, _ in self.limbs for j in samples.motion.rows]
         bad = [j for j in moving if self.share[j] > _UNEXPLAINED]
-        if 2 * len(bad) > len(self.share):
+        if 2 * len(bad) > len(model.joints):
             yield finding(
-                "unexplained_torque", name, what="robot", joints=len(bad), of=len(self.share),
-                share=float(np.median(self.share)),
+                "unexplained_torque", name, what="robot", joints=len(bad), of=len(model.joints),
+                share=float(np.median(self.share[-len(model.joints) :])),
             )  # fmt: skip
             return
         for j in bad:
             yield finding(
-                "unexplained_torque", name, self.probe.model.joints[j], what="joint",
+                "unexplained_torque", name, model.row_names[j], what="joint",
                 share=self.share[j],
             )  # fmt: skip
 
@@ -92,7 +95,7 @@ def is_suspect(check: TorqueCheck, others: Sequence[TorqueCheck]) -> bool:
 
 def _findings(samples: Samples, found: Sequence[Best], log: str) -> Iterator[Finding]:
     """Yield the findings of readings that explain the torques together."""
-    rows, joints = samples.motion.rows.tolist(), samples.motion.model.joints
+    rows, joints = samples.motion.rows.tolist(), samples.motion.model.row_names
     final = found[-1].after if found else np.zeros(len(rows))
     exchanged: dict[str, list[Best]] = {}
     for one in _with_one_gain(found):
@@ -116,8 +119,8 @@ def _findings(samples: Samples, found: Sequence[Best], log: str) -> Iterator[Fin
     for code, pairs in exchanged.items():
         order = np.arange(len(joints))
         for one in pairs:
-            i, k = one.reading.joints
-            order[[i, k]] = order[[k, i]]
+            first, second = np.split(np.array(one.reading.joints), 2)
+            order[[*first, *second]] = order[[*second, *first]]
         moved = np.flatnonzero(order != np.arange(len(joints)))
         owners = [f"tau_{joints[order[j]]} is the torque of {joints[j]}" for j in moved]
         yield finding(
@@ -145,14 +148,14 @@ _ORDERS = ("torque_order", "position_order", "joint_order")
 def _finding(samples: Samples, one: Best, log: str) -> Finding:
     """Return the finding of a reading."""
     model, reading = samples.motion.model, one.reading
-    names = [model.joints[j] for j in reading.joints]
+    names = [model.row_names[j] for j in reading.joints]
     worst = int(np.argmax(one.before - one.after))
     others = [r for r in one.alike if r.joints]
     values: dict[str, float | str] = {
-        "worst": model.joints[samples.motion.rows[worst]], "before": one.before[worst],
+        "worst": model.row_names[samples.motion.rows[worst]], "before": one.before[worst],
         "after": one.after[worst], "gain": one.gain, "what": "log", "cure": "log",
         "also": bool(others), "others": listed(
-            f"{r.code} of {listed(model.joints[j] for j in r.joints)}" for r in others
+            f"{r.code} of {listed(model.row_names[j] for j in r.joints)}" for r in others
         ),
     }  # fmt: skip
     if reading.code == "gravity":
@@ -170,6 +173,8 @@ def _finding(samples: Samples, one: Best, log: str) -> Finding:
         values["offset"] = reading.values[0]
     elif reading.code == "time_scale":
         values["speed"] = float(np.exp(-reading.values[0]))
+    elif reading.code == "angle_scale":
+        values["factor"] = 1.0 + reading.values[0]
     elif reading.code == "current_for_torque":
         values["factor"] = float(np.exp(-reading.values[0]))
     elif reading.code == "gravity_compensated":

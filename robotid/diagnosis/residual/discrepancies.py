@@ -196,6 +196,8 @@ class _Alteration:
             "angle_scale": {
                 "factor": 1 + x[0],
                 "named": f"q_{joint}" if joint else "every position",
+                "what": "residual",
+                "cure": "residual",
             },
             "torque_scale": {"factor": 1 + x[0], "what": sense, "cure": sense},
             "time_scale": {

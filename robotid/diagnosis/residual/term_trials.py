@@ -193,10 +193,8 @@ def take_sample(fit: Solution, *, for_drives: bool = False, is_free: bool = Fals
     tau = np.concatenate([m.tau for m in motion])
     size, first = model.layout.n_inertial, model.n_rows - len(model.joints)
     load = Y[:, first:, :size] @ fit.standard[:size]
-    basis = None
-    if model.constraints:
-        basis = np.concatenate([m.basis for m in motion if m.basis is not None])
-        Y = without_forces(basis, Y)
+    bases = [m.basis for m in motion if m.basis is not None]
+    basis = np.concatenate(bases) if bases else None
     r = tau - Y @ fit.standard
     used = np.concatenate([e.recording.mask[k] for e, k in parts])
     if basis is None and not for_drives:

@@ -133,7 +133,8 @@ class Predictions:
     def why_untested(self, joint: str) -> str:
         """Return why a joint was evaluated on no validation log."""
         if joint in self.fitted and not self.validation:
-            return "no validation log given"
+            given = "the validation logs contain fitted samples"
+            return given if self.refitted else "no validation log given"
         logs = "validation log" if joint in self.fitted else "recording"
         return f"it does not move in any {logs}"
 

@@ -43,7 +43,7 @@ from robotid.robot.bodies import held_parameters
 from robotid.robot.drive_term import DriveMotion
 from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
-from robotid.robot.parameters import pseudo_inertia
+from robotid.robot.parameters import INERTIAL_TERMS, pseudo_inertia
 
 SOURCES = ("data", "mixed", "prior", "bound")  # of the value of a standard parameter
 #: Standard error over prior standard deviation below which the source is the data (a change above
@@ -107,9 +107,18 @@ class Identified(ABC):
 
     @property
     def standard_interval(self) -> Array:
-        """95 % interval of each standard parameter, shape (p, 2); infinite if there is none."""
-        half = self.standard_quantile * self.standard_error
-        return np.column_stack([self.standard - half, self.standard + half])
+        """95 % interval of each standard parameter, shape (p, 2); infinite if there is none.
+
+        Of a consistent fit, it contains no negative mass, moment of inertia or friction.
+        """
+        half, layout = self.standard_quantile * self.standard_error, self.model.layout
+        low = self.standard - half
+        if self.is_consistent:
+            bounded = layout.is_nonnegative()
+            of_body = np.isin(INERTIAL_TERMS, ("m", "Ixx", "Iyy", "Izz"))
+            bounded[: layout.n_inertial] = np.tile(of_body, len(layout.bodies))
+            low = np.where(bounded & np.isfinite(half), np.maximum(low, 0.0), low)
+        return np.column_stack([low, self.standard + half])
 
     @property
     def base_interval(self) -> Array:
