@@ -477,7 +477,7 @@ class _PinocchioWriter:
         wanted, end = [], 0
         self._sources: list[tuple[Array | slice, float, slice, bool]] = []
         for j, (columns, places) in enumerate(zip(plan.inertial, plan.places, strict=True)):
-            for k, r in enumerate([j] if self._map is None else np.flatnonzero(G[:, j])):
+            for k, r in enumerate(np.array([j]) if self._map is None else np.flatnonzero(G[:, j])):
                 wanted.append(size * r + columns)
                 part = slice(end, end := end + len(columns))
                 self._sources.append((_as_slice(places), G[r, j], part, k > 0))
