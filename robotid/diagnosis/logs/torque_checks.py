@@ -12,8 +12,7 @@ from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.data.units import STATIC
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import BEYOND_NOISE, NO_ERROR_OF_MASSES, ROWS, SIGNIFICANT
-from robotid.diagnosis.logs.channels import ZERO
+from robotid.diagnosis.decisions import BEYOND_NOISE, NO_ERROR_OF_MASSES, ROWS, SIGNIFICANT, ZERO
 from robotid.diagnosis.logs.probe import Probe
 from robotid.diagnosis.logs.readings import CERTAIN, EXPLAINED, Best, Samples, best_readings, limbs
 from robotid.dynamics.base_parameters import BaseMapping
