@@ -180,7 +180,8 @@ class LoadModel:
 
     def misfit(self, scale: float) -> float:
         """Return the misfit of scaled torques: chi-square, prior included."""
-        return float(np.linalg.qr(self._rows(scale), mode="r")[-1, -1] ** 2)
+        R = np.asarray(np.linalg.qr(self._rows(scale), mode="r"))
+        return float(R[-1, -1] ** 2)
 
     def fit(self, scale: float = 1.0) -> tuple[float, Array, Array]:
         """Fit with the torque columns multiplied by a scale, without negative masses of links."""

@@ -118,6 +118,12 @@ def _of_robot(
         other = down + x @ across  # by angles with these tangents
         return model.with_gravity(other * g / np.linalg.norm(other)), at
 
+    def weighed(on: Array) -> Array:
+        # of the URDF's masses: those of the fit may have adapted to a base that moves
+        bodies, still = _bodies(model, model.standard_parameters()), _still(at)
+        pulled = [_torques(model.with_gravity(axis), bodies, still) for axis in g * np.eye(3)]
+        return np.stack(pulled, axis=2)
+
     def push(on: Array) -> Array:
         return np.concatenate([force_slopes(model, motion) for motion in at])
 
@@ -126,7 +132,7 @@ def _of_robot(
     least = 0.02 * float(np.linalg.norm(GRAVITY)) * pi[: model.layout.n_inertial : 10].sum()
     return (
         Reading("gravity", 0.025, level, lambda on: by.by_gravity @ across.T, tilted),
-        Reading("moving_gravity", 0.025, level, lambda on: g * by.by_gravity, changes=True),
+        Reading("moving_gravity", 0.025, level, weighed, changes=True),
         Reading("external_force", least, every, push),
         Reading("external_force", least, every, push, changes=True),
         Reading(
@@ -318,8 +324,7 @@ def _changing(
 
 def _is_main(accepted: Accepted[Option]) -> bool:
     """Return whether an option explains most of the residual, significantly."""
-    is_most = 100 * accepted.share >= decisions.MAIN
-    return is_most and accepted.p_value <= decisions.P_VALUE
+    return 100 * accepted.share >= decisions.MAIN and accepted.p_value <= decisions.P_VALUE
 
 
 def _grasped(sample: Sample, step: Accepted[int]) -> Finding:
