@@ -201,7 +201,7 @@ def test_findings_of_one_code_are_one_cause_and_say_what_they_share_once():
     assert bent.messages == ("arm_1: bent in 2 places", "arm_1: bent throughout")
     assert (bent.severity, bent.joints) == ("warning", ("arm_1",))
     assert (old.severity, old.joints, old.messages) == ("note", (), ("the URDF is of 2020",))
-    assert (small.code, small.severity) == ("static_joint", "note"), "every page counts it as a note"
+    assert (small.code, small.severity) == ("static_joint", "note"), "a cause of its own"
     assert tally((rest, bent, old, small)) == "1 error, 2 warnings, 2 notes"
     assert grouped([]) == ()
 

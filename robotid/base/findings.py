@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from string import Formatter
 from typing import Any
 
-_SPREAD = 0.1  # of the numbers of a setting that is stated once for several findings
+_SPREAD = 0.1  # of the numbers of a setting that is given once for several findings
 _RANK = {"error": 0, "warning": 1, "note": 2}
 _FACTORS = {" %": 100.0, " ms": 1e3}  # of the units that a slot may have
 #: Words that name subjects: sentences that differ only in them are one.
