@@ -35,8 +35,6 @@ from robotid.dynamics.torque import (
 from robotid.estimation.fitting.fitted import Fit
 from robotid.robot.model import GRAVITY, RobotModel
 
-_STEP = 1e-5  # step of a finite difference [-, rad or m]
-_STEPS = 5  # Gauss-Newton steps of a size
 _SPLINES = 40  # largest number of B-splines in time ...
 _BLOCKS = 3  # ... and blocks that are held out, of one of them
 _Altered = tuple[RobotModel, Sequence[Trajectory]]
@@ -160,11 +158,11 @@ def _bodies(model: RobotModel, pi: Array) -> Array:
 def _drive_slopes(model: RobotModel, pi: Array, at: Sequence[Trajectory], key: str) -> Array:
     """Return the derivatives of the drives' torques by q, v or a of each joint, (N, n, n)."""
     # Drives of their own joints only: all joints are moved together.
-    every, before = np.eye(len(model.joints)), _drives(model, pi, at)
+    h, every, before = decisions.STEP, np.eye(len(model.joints)), _drives(model, pi, at)
     is_plain = np.array_equal(model.layout.drive_ratios, every) and not is_loaded(model)
     moves = every.sum(axis=0, keepdims=True) if is_plain else every
-    ends = [[replace(m, **{key: getattr(m, key) + _STEP * on}) for m in at] for on in moves]
-    D = np.stack([(_drives(model, pi, end) - before) / _STEP for end in ends], axis=2)
+    ends = [[replace(m, **{key: getattr(m, key) + h * on}) for m in at] for on in moves]
+    D = np.stack([(_drives(model, pi, end) - before) / h for end in ends], axis=2)
     return D * every if is_plain else D
 
 
@@ -367,15 +365,15 @@ def _refined(
     """Return the sizes of an alteration, their standard errors, and the samples corrected by it."""
     # Torques are nonlinear over 0.1 rad: Gauss-Newton steps until the sizes converge.
     every, error = list(range(len(x))), np.full(len(x), np.inf)
-    for _ in range(_STEPS):
+    for _ in range(decisions.STEPS):
         model, at = applied(x)
         tau = _torques(model, pi, at)
         sample = along(sample, model, at, tau)
-        beyond = [applied(x + _STEP * axis) for axis in np.eye(len(x))]
+        beyond = [applied(x + decisions.STEP * axis) for axis in np.eye(len(x))]
         moved = [_torques(model, pi, at) for model, at in beyond]
-        Z = (np.stack(moved, axis=-1) - tau[..., None]) / _STEP
+        Z = (np.stack(moved, axis=-1) - tau[..., None]) / decisions.STEP
         step, covariance = Trials(sample, Z).whole.estimate(every, sample.fitted)
         x, error = x + step, np.sqrt(np.diag(covariance))
-        if np.linalg.norm(step) < 0.1 * np.linalg.norm(error):
+        if np.linalg.norm(step) < decisions.SETTLED * np.linalg.norm(error):
             break
     return x, error, sample

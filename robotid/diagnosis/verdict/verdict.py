@@ -21,7 +21,8 @@ from robotid.estimation.fitting.evaluation import JointMetrics, Metrics, logs_th
 
 GOOD = 15.0  # [%] largest torque prediction error on validation logs of a joint that is "good"
 POOR = 50.0  # [%] a joint with a larger torque prediction error is not usable
-GOOD_POSITION, POOR_POSITION = 5.0, 30.0  # [%] the same limits of simulated position errors
+GOOD_POSITION = 5.0  # [%] the same limit of simulated position errors
+POOR_POSITION = 30.0
 #: Error over that of the second-order model from which it is hardly smaller: half the squares.
 HARDLY = 0.7
 BEATEN = 1.05  # A simpler model is better if its error is smaller by this factor ...
