@@ -191,7 +191,7 @@ def not_written(log_errors: Sequence[Finding], inconsistent: str = "") -> Iterat
 
 
 def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]:
-    """Return a warning about locked joints whose positions matter but were not stated."""
+    """Return a warning about locked joints whose positions matter but were not given."""
     # A position matters on a chain with an identified joint; on a floating base all matter.
     relevant = set(model.locked) if model.free_flyer else _in_line(model)
     assumed = [name for name in model.locked if name not in stated and name in relevant]
