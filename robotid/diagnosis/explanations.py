@@ -2,7 +2,7 @@
 
 Findings have stages: 1 the meaning of channels, 2 their values, 3 the torques, 4 what has no named
 cause, 5 the residual of a fit, 6 differences between logs. What is found of a fit is evidence only
-if no certain reading of a log, which would change that fit, stands unapplied.
+if every certain reading of a log, which would change that fit, was applied.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -24,13 +24,13 @@ def explained(
     """Return findings without those that one of an earlier stage explains; of a fit as notes."""
     carried = model.support[-len(model.joints) :, : model.layout.n_inertial : 10]
     bound = dict(zip(model.joints, carried @ carried.T, strict=True))
-    rest, stands = list(findings), list[Finding]()
+    rest, causes = list(findings), list[Finding]()
     for one in sorted((x for x in rest if x.severity != "note" and _stage(x)), key=_stage):
-        if any(_explains(cause, one, bound) for cause in stands):
+        if any(_explains(cause, one, bound) for cause in causes):
             i, notes = rest.index(one), [one.reworded(severity="note")]
             rest[i : i + 1] = notes if _stage(one) >= _RESIDUAL else []
         elif one.code not in ignore and one.evidence.get("gain", 1.0) > BETTER:
-            stands.append(one)
+            causes.append(one)
     return rest
 
 
@@ -41,7 +41,7 @@ def _stage(one: Finding) -> int:
 
 
 def _explains(cause: Finding, one: Finding, bound: Mapping[str, Array]) -> bool:
-    """Return whether a finding that stands explains one of its stage or a later one."""
+    """Return whether a finding explains one of its stage or a later one."""
     before, stage, joints = _stage(cause), _stage(one), [*bound]
     if stage < _UNNAMED:  # it is found of one channel, or with the readings before it applied
         return (
