@@ -188,7 +188,7 @@ def take_sample(fit: Solution, *, for_drives: bool = False, is_free: bool = Fals
     if number < decisions.FEWEST:
         return None
     motion = [e.recording.trajectory.at(k) for e, k in parts]
-    Y = np.concatenate([_regressor(model, e.recording.trajectory, k) for e, k in parts])
+    Y = np.concatenate([regressor(model, e.recording.trajectory, k) for e, k in parts])
     tau = np.concatenate([m.tau for m in motion])
     size, first = model.layout.n_inertial, model.n_rows - len(model.joints)
     load = Y[:, first:, :size] @ fit.standard[:size]
@@ -249,7 +249,7 @@ def _free(sample: Sample, X: Array) -> Sample:
 
 def along(sample: Sample, model: RobotModel, at: Sequence[Trajectory], tau: Array) -> Sample:
     """Return the same samples for another robot, or with changed positions."""
-    Y = np.concatenate([_regressor(model, motion) for motion in at])
+    Y = np.concatenate([regressor(model, motion) for motion in at])
     W = sample.weight[:, :, None] * _in_units(Y, sample.independent, sample.U)
     W = np.concatenate([W, sample.W[:, :, W.shape[2] :]], axis=2)
     r = sample.weight * (np.concatenate([motion.tau for motion in at]) - tau)
@@ -284,7 +284,7 @@ def _segments(fitted: int, validation: int, independent: float) -> tuple[slice, 
     return tuple(slice(*pair) for pair in pairwise(edges))
 
 
-def _regressor(model: RobotModel, motion: Trajectory, samples: Array | None = None) -> Array:
+def regressor(model: RobotModel, motion: Trajectory, samples: Array | None = None) -> Array:
     """Return the regressor of the standard parameters at some samples, shape (N, n, p)."""
     Y = trajectory_regressor(model, motion, samples)
     return Y.reshape(-1, model.n_rows, Y.shape[1])

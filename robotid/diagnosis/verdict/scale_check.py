@@ -281,7 +281,7 @@ class ScaleCheck:
 
     @property
     def _is_total_open(self) -> bool:
-        """Whether the total mass is stated, and not by torque: it does not count as identified."""
+        """Whether the total mass is given, and not by torque: it does not count as identified."""
         stated = self.stated
         return stated is not None and stated.ratio is None and "total_mass" in stated.names
 
