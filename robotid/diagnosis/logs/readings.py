@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.diagnosis.logs.channels import ZERO
+from robotid.diagnosis.decisions import ZERO
 from robotid.diagnosis.logs.probe import Probe, drive_columns
 from robotid.dynamics.constraint_rows import (
     constraint_jacobian,
@@ -258,6 +258,12 @@ class Samples:
         for segment in products:
             left += _left(segment, _fitted(self.motion, whole - segment, size))
         return _over(left, size)
+
+    @property
+    def urdf_size(self) -> Array:
+        """Sum of squares of the torque of the URDF's bodies on each joint, (m,)."""
+        c = -self.motion.tau.shape[1] - 1
+        return np.asarray(self.motion.products[..., c, c].sum(axis=0))
 
     @property
     def unexplained(self) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
@@ -13,8 +13,9 @@ import numpy as np
 
 from robotid.base.findings import Finding, listed, toml_key
 from robotid.base.typing import Array
+from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis import decisions
-from robotid.diagnosis.catalogue import codes_with, finding, is_cause
+from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.residual.term_trials import Sample, Trials
 from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.estimation.fitting.fitted import Fit
@@ -23,8 +24,7 @@ from robotid.robot.drives import FAMILIES, Harmonic, drive_line, has_turned
 
 _RIPPLES = np.arange(5, 241)  # periods per revolution tested: 200 of a gear of 100 : 1
 _PEAKS = 6  # of them are tested: those with the largest periodic residual
-_STEEP = 8  # twice the order of the filter, which is applied in both directions
-_REVERSES = 0.05  # of the RMS value: width of a change of a coupling's direction or a gear's side
+_STEEP = 2 * SignalSettings.order  # of the filter, which is applied in both directions
 _WINDUP = (0.02, 0.1)  # of the RMS displacement since a reversal: decay of a deflection
 _OF_POSITION = ("position_periodic", "spring", "position_offset")
 _OF_FORCE = ("gravity", "moving_gravity", "external_force")
@@ -113,7 +113,7 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
             trend_error = float(np.sqrt(per_minute @ accepted.covariance @ per_minute))
             trend = float(per_minute @ theta), trend_error
         families = [name for name in best.families if has_turned(name, angle)]
-        if np.sqrt(accepted.share) * error >= decisions.MISFIT_REPORTED:
+        if np.sqrt(accepted.share) * error >= decisions.LEAST_TERM:
             yield Misfit(
                 sample.joints[j], best, accepted.share, accepted.p_value, accepted.confirmed,
                 size, std_error, (best.units or ("N m rms", "N rms"))[int(is_prismatic)], error,
@@ -210,12 +210,15 @@ def ripples(m: JointMotion, weight: Array, r: Array) -> tuple[Candidate, ...]:
     )  # fmt: skip
 
 
+def _sense(m: JointMotion, of: Callable[[JointMotion], Array]) -> Array:
+    """Return the sign of a signal, shape (N,), continuous where it is about 0."""
+    return np.asarray(np.tanh(of(m) / (decisions.ZERO * _rms(m, of))))
+
+
 def _windup(m: JointMotion) -> Array:
     displacement = m.travelled[:, None] / (np.array(_WINDUP) * _rms(m, attrgetter("travelled")))
     deflection = m.direction[:, None] * np.exp(-displacement)
-    return np.column_stack(
-        [deflection, np.tanh(m.load / (_REVERSES * _rms(m, attrgetter("load"))))]
-    )
+    return np.column_stack([deflection, _sense(m, attrgetter("load"))])
 
 
 def _drift(m: JointMotion) -> Array:
@@ -226,13 +229,11 @@ def _coupled(m: JointMotion, other: str, ratio: float) -> Array:
     """Return columns of a drive at the speed w = v + ratio v' of both joints, at the first."""
 
     def drive_speed(motion: JointMotion) -> Array:
-        return motion.v + ratio * motion.others[other].v
+        return motion.v + ratio * motion.others[other].v if other in motion.others else motion.v
 
-    if other not in m.others:  # it is at rest
-        none = np.zeros_like(m.v)
-        return np.column_stack([none, none, np.tanh(m.v / (_REVERSES * _rms(m, drive_speed)))])
-    partner, w = m.others[other], drive_speed(m)
-    return np.column_stack([partner.a, partner.v, np.tanh(w / (_REVERSES * _rms(m, drive_speed)))])
+    partner, rest = m.others.get(other), np.zeros_like(m.v)
+    own = (rest, rest) if partner is None else (partner.a, partner.v)
+    return np.column_stack([*own, _sense(m, drive_speed)])
 
 
 #: The candidates of each joint, without couplings and ripples, an entry each.
@@ -294,9 +295,7 @@ def with_entries(fit: Fit, joint: str, entries: Sequence[str | DriveTerm]) -> st
     return drive_line(joint, *stated, *others, *entries)
 
 
-def settled(
-    before: Sequence[Finding], of_fit: Sequence[Finding], ignore: Collection[str] = ()
-) -> list[Finding]:
+def settled(before: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Finding]:
     """Return the findings before and of the fit, without hypotheses that a term explains."""
     # The doctor attributes a torque that depends on the position to wrong masses. The term that
     # explains it is then a warning, even if it is small.
@@ -312,24 +311,13 @@ def settled(
                 evidence={**term.evidence, "replaces": float(len(hypotheses))},
             )
         terms.append(term)
-    # torques in another unit bind the bodies to a wrong prior, whose error looks like a term
-    rescaled = {joint for f in rest if f.code == "current_for_torque" for joint in f.joints}
-    delayed = any(f.code == "torque_delay" for f in rest)
-    # a channel that is read wrongly leaves a residual that looks like other causes
-    wrong = set(codes_with("ignorable")).difference(ignore)
-    is_misread = any(f.severity == "error" and f.code in wrong for f in rest)
-    explained = [
-        f for f in terms
-        if (f.code in codes_with("term") and rescaled.issuperset(f.joints))
-        or (f.code == "joint_delay" and delayed)
-        or (is_misread and f.severity == "warning" and is_cause(f.code))
-    ]  # fmt: skip
-    return rest + [f.reworded(severity="note") if f in explained else f for f in terms]
+    return rest + terms
 
 
 def _explains(term: Finding, hypothesis: Finding) -> bool:
     """Return whether a term of the fit explains a hypothesis from before the fit."""
-    if term.evidence.get("share_pct", 0.0) < decisions.MAIN:
+    shares = [term.evidence.get(key, np.inf) for key in ("share_pct", "validation_share_pct")]
+    if "share_pct" not in term.evidence or min(shares) < decisions.MAIN:
         return False
     if hypothesis.code == "unexplained_torque":
         return not term.joints or hypothesis.joints == term.joints

@@ -1,5 +1,6 @@
 """Another scale of the torques, another robot's URDF, an uninformative torque: told apart."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -87,9 +88,9 @@ def test_the_fit_is_the_least_squares_of_all_joints_and_drives(ur5, ur5_log):
     probe = take_probe(ur5, smooth_motion(ur5, ur5_log, SIGNALS))
     share = TorqueCheck.of(probe).share
     model = load_model(probe, share)
-    scale = np.array([1.0, 2.0, 1.0, 0.5, 1.0, 1.0])
+    scale = 2.0
     chi, theta, error = model.fit(scale)
-    assert model.misfits(scale[None])[0] == pytest.approx(chi, rel=1e-9)
+    assert model.misfit(scale) == pytest.approx(chi, rel=1e-9)
     N, n, bodies = len(probe.rows), 6, 6
     pi = ur5.standard_parameters()[: ur5.layout.n_inertial].reshape(-1, 10)
     Y = joint_torque_regressor(ur5, probe.q, probe.v, probe.a)[:, : ur5.layout.n_inertial]
@@ -101,7 +102,7 @@ def test_the_fit_is_the_least_squares_of_all_joints_and_drives(ur5, ur5_log):
         drive = probe.drives[:, j]
         others = np.zeros((N, n * drive.shape[1]))
         others[:, j * drive.shape[1] : (j + 1) * drive.shape[1]] = drive
-        rows.append(np.hstack([own, others]) / scale[j] / sigma)
+        rows.append(np.hstack([own, others]) / scale / sigma)
         right.append(probe.tau[:, j] / sigma)
     rows[0] = np.hstack([rows[0], np.zeros((10, rows[1].shape[1] - 10))])
     A, b = np.vstack(rows), np.concatenate(right)
@@ -253,8 +254,11 @@ def test_a_log_without_a_filter_is_judged_too(ur5):
     signals = replace(SIGNALS, cutoff=None)
     log = exact_log(ur5, truth(ur5), np.random.default_rng(0), samples=800, rate=100.0)
     (clean,) = found(ur5, log, signals)
-    (spoilt,) = found(ur5, delayed(log, 0.03), signals)
+    (spoilt,) = found(ur5, delayed(log, 0.04), replace(signals, torque_delay=0.01))
     assert (clean.severity, spoilt.severity) == ("note", "warning")
+    assert spoilt.evidence["delay"] == pytest.approx(0.03, abs=5e-3)
+    total = re.search(r"set torque_delay = (\S+) \(", spoilt.message)[1]
+    assert float(total) == pytest.approx(0.04, abs=5e-3)  # what is stated is part of it
 
 
 def test_noise_of_a_log_without_a_filter_is_no_delay(ur5):
