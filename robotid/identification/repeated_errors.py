@@ -13,13 +13,7 @@ torque per acceleration of the base. The bias is estimated together with the par
 base turns, and subtracted; the covariance D Cov(b) D^T is left in the score. Its prior size: a
 robot hardly moves away, so its mean acceleration in the world is that of the bias.
 
-Without torques of joints the residual is mostly an error E of the regressor, as of the motion of
-soft tissue. The score then has the mean -E^T E theta: least squares underestimates the mass, and
-neither more data nor the scatter of segments show it. E is the error of the acceleration of the
-base that would cause the residual; its effect is counted as an error.
-
 References:
-    Carroll, Ruppert, Stefanski, Crainiceanu (2006), Measurement Error in Nonlinear Models.
     Bishop (2006), Pattern Recognition and Machine Learning, section 3.5 (evidence).
 """
 
@@ -30,11 +24,10 @@ import numpy as np
 import scipy.linalg
 from scipy.optimize import minimize_scalar
 
-from robotid.base.tolerances import CONVERGED, TINY
+from robotid.base.tolerances import CONVERGED
 from robotid.base.typing import Array
 from robotid.data.base_motion import in_base
 from robotid.data.log import Trajectory
-from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.constraint_rows import constraint_forces, contact_links, without_forces
 from robotid.dynamics.factors import Triangle, join, triangle_of
 from robotid.dynamics.prepared_logs import base_problem
@@ -51,15 +44,14 @@ _STEPS = 20  # of noise level and s
 
 
 def with_repeated_errors(recordings: Recordings) -> Recordings:
-    """Return recordings with the score's covariance due to contacts, accelerometers, motion."""
+    """Return recordings with the score's covariance due to contacts and accelerometers."""
     # surfaces have no errors of their points: their moments are measured, or unknown
     model, mapping = recordings.model, recordings.mapping
     points = [k for k, x in enumerate(model.contacts) if x.kind == "point" and x.uncertainty != 0.0]
     bases = [log.head.base for log in recordings.fitted]
     frames = [None if base is None or base.imu is None else base.imu.frame for base in bases]
     biases = [x.offset if x.offset is not None else np.zeros(3) for x in frames if x is not None]
-    is_blind = model.free_flyer and not any(log.head.has_torque for log in recordings.fitted)
-    if not (points or biases or is_blind):
+    if not (points or biases):
         return recordings
     whole, prior = join(recordings.reduce(is_cut=False)), model.standard_parameters()
     spread = prior_spread(model, whole.squares, whole.samples)
@@ -69,9 +61,6 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
     c, d = 3 * len(points), 3 * bool(biases)
     total, drifts = Triangle(b + c + d + 1), []
     step = max(1, int(0.5 / recordings.share))  # filtered rows in between add nothing
-    shift = _shift(recordings, start, step) if is_blind else np.empty((b, 0))
-    if not c + d:
-        return replace(recordings, repeated=RepeatedErrors(shift, 0.0, 0.0, has_motion=True))
     for log, frame in zip(recordings.fitted, frames, strict=True):
         pushed, segments = list[Array](), list[Array]()
         for piece in log.pieces:
@@ -102,8 +91,8 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
     roots = _roots(fit, sizes, c)
     rest = np.sum((total.R[b:-1, b:-1] @ roots) ** 2)  # of D, what W cannot explain
     largest = float(np.where(np.isnan(sizes), fit.size, sizes)[:c].max(initial=0.0))
-    root = np.column_stack([total.R[:b, :b].T @ total.R[:b, b:-1] @ roots, shift])  # -W^T D
-    errors = RepeatedErrors(root, float(rest) / count, largest, has_motion=is_blind)
+    root = total.R[:b, :b].T @ total.R[:b, b:-1] @ roots  # -W^T D
+    errors = RepeatedErrors(root, float(rest) / count, largest)
     if not d:
         return replace(recordings, repeated=errors)
     bias, variance = biases[0] + fit.known[c:], np.mean(np.diag(fit.covariance)[c:])
@@ -220,33 +209,6 @@ def _slopes_of_bias(model: RobotModel, rows: Rows, pi: Array) -> Array:
     if rows.trajectory.basis is not None:
         D = without_forces(rows.trajectory.basis, D)
     return D.reshape(-1, 3)
-
-
-def _shift(recordings: Recordings, theta: Array, step: int) -> Array:
-    """Return the sum of ``_shift_of_motion`` over all logs, of every step-th row, shape (b, 1)."""
-    shift = np.zeros((len(theta), 1))
-    for rows in (piece.read() for log in recordings.fitted for piece in log.pieces):
-        rows = replace(rows, trajectory=rows.trajectory.every(step), mask=rows.mask[::step])
-        shift[:, 0] += step * _shift_of_motion(recordings.model, recordings.mapping, rows, theta)
-    return shift
-
-
-def _shift_of_motion(model: RobotModel, mapping: BaseMapping, rows: Rows, theta: Array) -> Array:
-    """Return E^T E theta, (b,): E, errors of the base's acceleration, causes the residual."""
-    motion, shift = rows.trajectory, np.zeros(len(theta))
-    pushed = [replace(motion, a=motion.a + np.eye(1, model.n_rows, k)) for k in range(6)]
-    problems = [base_problem(model, mapping, x, rows.mask).blocks() for x in (motion, *pushed)]
-    for (W, tau, weight), *others in zip(*problems, strict=True):
-        root = np.sqrt(weight)[:, None]
-        G = np.stack([root * (other - W) for other, *_ in others], axis=1)  # (m, 6, b) per m/s^2
-        G = G.reshape(-1, model.n_rows, *G.shape[1:])
-        residual = (root[:, 0] * (tau - W @ theta)).reshape(-1, model.n_rows)
-        A = G @ theta  # (n, n_rows, 6), inertia of the whole robot
-        # singular if the forces of some of its axes are not known
-        e = (np.linalg.pinv(A, rcond=TINY) @ residual[..., None])[..., 0]
-        E = np.einsum("nric,ni->nrc", G, e)
-        shift += np.einsum("nrc,nr->c", E, E @ theta)
-    return shift
 
 
 def _world_acceleration(motion: Trajectory, bias: Array) -> Array:

@@ -12,14 +12,11 @@ from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.constraint_rows import constraint_jacobian, touching
-from robotid.dynamics.prepared_logs import base_problem
 from robotid.dynamics.torque import predict
 from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.identification.repeated_errors import (
     EstimatedErrors,
     _roots,
-    _shift,
-    _shift_of_motion,
     _slopes,
     _world_acceleration,
     estimated_errors,
@@ -205,49 +202,3 @@ def test_the_acceleration_in_the_world_is_turned_and_has_the_bias_back(log, rng)
     local = motion.a[:, :3] + np.cross(motion.v[:, 3:6], motion.v[:, :3])
     world = np.einsum("kij,kj->ki", R, local + bias)
     np.testing.assert_allclose(_world_acceleration(motion, bias), world, atol=1e-9)
-
-
-def test_errors_of_the_acceleration_of_the_base_shift_the_score_by_their_square():
-    """Where no torques are measured; errors +e and -e leave their squares in the mean score."""
-    foot = Contact(FEET[0], "surface", ("fx", "fy", "fz", "mx", "my", "mz"), axes="link")
-    model = RobotModel.from_urdf(
-        example_urdf("solo12.urdf"), free_flyer=True, terms=(), constraints=[foot]
-    )
-    rng, mapping = np.random.default_rng(4), structural_mapping(model)
-    t = 2.0 + 0.01 * np.arange(60)
-    pose = np.array([
-        pin.SE3ToXYZQUAT(pin.SE3(pin.exp3(0.3 * rng.normal(size=3)), rng.normal(size=3)))
-        for _ in t
-    ])  # fmt: skip
-    joints = rng.uniform(-1, 1, (len(t), 12))
-    log = Log(
-        t, joints, 0 * joints, model.joints, has_torque=False, base=BaseMotion(pose),
-        wrenches={f"{part} {FEET[0]}": 0 * t for part in foot.measured},
-    )  # fmt: skip
-    rows = hold_log(model, log, RAW).whole
-    motion = rows.trajectory
-    motion = replace(motion, v=0.3 * rng.normal(size=motion.v.shape), a=0.0 * motion.a)
-    (torque,) = predict(model, [model.standard_parameters()], motion)
-    theta = mapping.to_base(model.standard_parameters())
-    e = rng.normal(size=(len(motion.t), 6)) * [0.5, 0.3, 0.4, 2.0, 3.0, 1.0]
-
-    def with_errors(sign):
-        a = motion.a + sign * np.hstack([e, np.zeros((len(e), 12))])
-        return replace(rows, trajectory=replace(motion, a=a, tau=torque))
-
-    def score(own):
-        problem = base_problem(model, mapping, own.trajectory, own.mask)
-        return sum(W.T @ (weight * (tau - W @ theta)) for W, tau, weight in problem.blocks())
-
-    mean = 0.5 * (score(with_errors(1.0)) + score(with_errors(-1.0)))
-    shift = _shift_of_motion(model, mapping, with_errors(1.0), theta)
-    np.testing.assert_allclose(shift, -mean, atol=1e-9 * np.abs(mean).max())
-    found = with_repeated_errors(Recordings(model, mapping, [hold_log(model, log, RAW)])).repeated
-    assert found.root.shape == (len(theta), 1)
-    assert found.described == "errors of the motion of the base that would cause the residual"
-    held = hold_log(model, log, RAW)
-    some = replace(rows, trajectory=rows.trajectory.every(3), mask=rows.mask[::3])
-    of_some = _shift_of_motion(model, mapping, some, theta)  # a third of one of two logs
-    two = _shift(Recordings(model, mapping, [held, held]), theta, 3)
-    np.testing.assert_allclose(two[:, 0], 2 * 3 * of_some, rtol=1e-9)
-    assert np.abs(of_some).max() > 0.0

@@ -11,7 +11,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process, resolve, unwrap
 from robotid.data.units import AT_REST
 from robotid.diagnosis.decisions import ZERO
-from robotid.dynamics.constraint_rows import constraint_jacobian, measured_rows, touching
+from robotid.dynamics.constraint_rows import touching
 from robotid.dynamics.rows import drive_values, friction_directions, friction_speeds, inertial_rows
 from robotid.robot.model import RobotModel
 
@@ -31,22 +31,13 @@ class Probe:
     v: Array  # (N, n), velocities
     a: Array  # (N, n), accelerations
     tau: Array  # (N, n), torques [N m or N]
-    contacts: Array | None = None  # (N, k), those that may touch the ground; None without any
-    forces: Array | None = None  # (N, n), torques of measured forces
+    contacts: Array  # (N, k), those that may touch the ground
 
     @classmethod
     def of(cls, model: RobotModel, motion: Trajectory, rows: Array) -> "Probe":
         """Return the probe at rows of a motion."""
-        at = (x[rows] for x in (motion.q, motion.v, motion.a, motion.tau))
-        probe = cls(model, motion, rows, *at)
-        if not model.constraints:
-            return probe
-        contacts = touching(model, motion)[rows]
-        forces = np.zeros(probe.tau.shape)
-        if motion.wrenches is not None:
-            J = constraint_jacobian(model, probe.q, contacts)[:, measured_rows(model)]
-            forces = np.einsum("kmj,km->kj", J, motion.wrenches[rows])
-        return replace(probe, contacts=contacts, forces=forces)
+        q, v, a, tau = (x[rows] for x in (motion.q, motion.v, motion.a, motion.tau))
+        return cls(model, motion, rows, q, v, a, tau, touching(model, motion)[rows])
 
     @cached_property
     def _places(self) -> tuple[Array, Array]:

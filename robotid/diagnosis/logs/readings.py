@@ -21,12 +21,7 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.diagnosis.decisions import ZERO
 from robotid.diagnosis.logs.probe import Probe, drive_columns
-from robotid.dynamics.constraint_rows import (
-    constraint_jacobian,
-    force_basis,
-    measured_rows,
-    without_forces,
-)
+from robotid.dynamics.constraint_rows import constraint_jacobian, force_basis, without_forces
 from robotid.dynamics.rows import inertial_rows, joint_constants
 from robotid.robot.model import GRAVITY, RobotModel
 from robotid.robot.prior import prior_spread
@@ -80,14 +75,13 @@ class _Motion:
     tau: Array  # (N, n) [N m or N], columns as logged
     size: Array  # (n,), squared variation of each of them, 0 if constant
     rows: Array  # (m,), the limb's joints
+    contacts: Array  # (N, k), those that may touch the ground
     spread: Array  # (p,), prior deviations of the bodies
     gravity: Array  # (n,), factor of the torque of gravity on each joint
     inertia: Array  # (n,), factor of the torque of inertia on each joint
     clock: float = 1.0  # speed of the time stamps
     subtracted: float = 0.0  # factor of the URDF's gravity that was subtracted from the torques
     segments: int = _SEGMENTS  # of the instants
-    contacts: Array | None = None  # (N, k), those that may touch the ground; None without any
-    forces: Array | None = None  # (N, n) [N m or N], torques of measured forces
 
     @cached_property
     def products(self) -> Array:
@@ -114,7 +108,7 @@ class _Motion:
             own = np.zeros((N, _DRIVE, len(rows), n))
             own[:, :, np.arange(len(rows)), rows] = drive.swapaxes(1, 2)
             drive = own.reshape(N, -1, n).swapaxes(1, 2)
-            urdf, logged = urdf - self.forces, self.tau[:, None] * np.eye(n)
+            logged = self.tau[:, None] * np.eye(n)
         P = np.concatenate([bodies, coupled, drive, urdf[..., None], logged], axis=2)
         P = (P if self.basis is None else without_forces(self.basis, P)[:, rows]).swapaxes(0, 1)
         edges = np.linspace(0, N, self.segments + 1).astype(int).tolist()
@@ -123,11 +117,10 @@ class _Motion:
 
     @cached_property
     def basis(self) -> Array | None:
-        """Basis of the torques of unknown forces of contacts; None without contacts."""
-        if self.contacts is None:
+        """Basis of the torques of forces of contacts, measured or not; None without contacts."""
+        if not self.model.constraints:
             return None
         J = constraint_jacobian(self.model, self.q, self.contacts)
-        J = np.delete(J, measured_rows(self.model), axis=1)
         return force_basis(J, np.ones(self.v.shape, dtype=bool))
 
     @property
@@ -140,7 +133,7 @@ class _Motion:
     @cached_property
     def reach(self) -> Array:
         """The limb's joints, or all rows if forces of contacts connect them."""
-        return self.rows if self.contacts is None else np.arange(self.tau.shape[1])
+        return np.arange(self.tau.shape[1]) if self.model.constraints else self.rows
 
     @cached_property
     def moved(self) -> Array:
@@ -172,17 +165,15 @@ class Samples:
         one, model = np.ones(probe.tau.shape[1]), probe.model
         spread = prior_spread(model, np.ones((3, model.n_rows)), 1)[: model.layout.n_inertial]
         at = probe.q, probe.v, probe.a, probe.tau, one
-        motion = _Motion(model, *at, rows, _LOOSE * spread, one, one)
-        motion = replace(motion, contacts=probe.contacts, forces=probe.forces)
+        motion = _Motion(model, *at, rows, probe.contacts, _LOOSE * spread, one, one)
         motion = replace(motion, size=moves * motion.variation)
         return cls(motion, np.arange(len(one)), one, one)
 
     def few(self) -> "Samples":
         """Return some of the instants, in one segment, with bodies nearer the URDF's."""
         step = max(1, len(self.motion.q) // _FEW)
-        channels = ("q", "v", "a", "tau", "contacts", "forces")
-        known = {key: getattr(self.motion, key) for key in channels}
-        some = {key: x if x is None else x[::step] for key, x in known.items()}
+        channels = ("q", "v", "a", "tau", "contacts")
+        some = {key: getattr(self.motion, key)[::step] for key in channels}
         few = self.changed(segments=1, spread=self.motion.spread / _LOOSE, **some)
         return few.changed(size=(self.motion.size > 0.0) * few.motion.variation)
 
@@ -204,18 +195,16 @@ class Samples:
     def _problem(self) -> tuple[Array, Array]:
         """Products of columns and torque of each segment and joint, and the variation (m,)."""
         m, rows = self.motion, self.motion.rows
-        G, k = m.products, np.arange(len(rows))
+        G, k = m.products, len(rows)
         c = G.shape[-1] - m.tau.shape[1] - 1  # place of the URDF's torque
         gain = self.gain[rows]
-        read = np.zeros((len(rows), m.tau.shape[1] + 1))  # factors of it and of torque columns
-        scale = np.ones((len(rows), c))
-        if m.basis is None:
-            read[k, 1 + self.order[rows]] = self.sign[rows] / gain
-            scale[:, c - _DRIVE :] /= gain[:, None]
-        else:
-            read[:, 1 + rows] = self.sign[rows] / gain
-            scale[:, c - _DRIVE * len(rows) :] /= np.tile(gain, _DRIVE)
-        read[:, 0] = -1.0
+        one = np.repeat(gain[:, None], _DRIVE, axis=1)
+        drives, on = (one, np.eye(k)) if m.basis is None else (np.tile(gain, (k, _DRIVE)), 1.0)
+        scale = np.ones((k, c))
+        scale[:, c - drives.shape[1] :] /= drives
+        read = np.full((k, m.tau.shape[1] + 1), -1.0)  # factors of it and of torque columns
+        read[:, 1:] = 0.0
+        read[:, 1 + self.order[rows]] = on * self.sign[rows] / gain
         b = G[..., c:] @ read[..., None]  # (K, m, C, 1)
         made = np.empty((*G.shape[:2], c + 1, c + 1))
         made[..., :c, :c] = scale[:, :, None] * scale[:, None] * G[..., :c, :c]
@@ -229,26 +218,6 @@ class Samples:
         products, size = self._problem
         whole = products.sum(axis=0)
         return _over(_left(whole, _fitted(self.motion, whole, size)), size)
-
-    def gain_without(self, joints: tuple[int, ...]) -> float:
-        """Return the gain of the torques of some joints that the other joints predict."""
-        products, size = self._problem
-        rows, at = self.motion.rows, np.isin(self.motion.rows, joints) & (size > 0.0)
-        x = _fitted(self.motion, products.sum(axis=0), np.where(at, 0.0, size))
-        # tau = gain (X x + X pi) + drives, by the products of these columns
-        G, c = self.motion.products.sum(axis=0), x.shape[1]
-        squares = np.zeros((1 + _DRIVE * int(at.sum()),) * 2)
-        b = np.zeros(len(squares))
-        for k, j in enumerate(np.flatnonzero(at)):
-            own = 1 + _DRIVE * k + np.arange(_DRIVE)
-            P = np.zeros((G.shape[-1], 1 + _DRIVE))
-            P[: c - _DRIVE, 0], P[c, 0] = x[j, : c - _DRIVE], 1.0
-            P[c - _DRIVE : c, 1:] = np.eye(_DRIVE)
-            column = c + 1 + self.order[rows[j]]
-            places = np.append(0, own)
-            squares[np.ix_(places, places)] += P.T @ G[j] @ P / size[j]
-            b[places] += self.sign[rows[j]] * P.T @ G[j][:, column] / size[j]
-        return float(np.linalg.lstsq(squares, b)[0][0])
 
     @cached_property
     def held_out(self) -> Array:
@@ -409,12 +378,13 @@ def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
         yield Reading("unsigned_torque", group, partial(_signed, joints=group))
     wrists = [tuple(rows[first:]) for first in range(1, len(rows) - 1)]
     for group in [tuple(rows), *singles, *(legs or wrists)]:
-        scaled = partial(_scaled, on=one[list(group)].sum(axis=0))
-        named = group if len(group) < len(rows) else every  # another unit
-        if m.basis is not None:
-            yield from Reading("current_for_torque", named, scaled, (), 0.3).started(samples)
-        elif (gain := samples.gain_without(group)) > 0.0:
-            yield Reading("current_for_torque", named, scaled, (float(np.log(gain)),), 0.3)
+        named, on = group if len(group) < len(rows) else every, one[list(group)].sum(axis=0)
+        scaled = Reading("current_for_torque", named, partial(_scaled, on=on), (), 0.3)
+        yield from scaled.started(samples)
+        at = np.isin(rows, group)
+        if m.basis is None and samples.urdf_size[at].any():  # by the ratio to the URDF's torques
+            ratio = np.sum(m.tau[:, m.rows[at]] ** 2) / samples.urdf_size[at].sum()
+            yield replace(scaled, values=(0.5 * float(np.log(ratio + _FLOOR)),))
     for j in turning:
         shifted = Reading("position_offset", (j,), partial(_shifted, on=place[j]), (), 0.1)
         if m.basis is not None:

@@ -468,7 +468,6 @@ class RepeatedErrors:
     points: float  # standard deviation of points of contact, the largest [m]
     bias: Array | None = None  # (3,), that of the accelerometers that was subtracted [m/s^2]
     bias_error: float = 0.0  # its standard error, root mean square of the axes [m/s^2]
-    has_motion: bool = False  # whether errors of the motion of the base are counted
 
     @property
     def described(self) -> str:
@@ -482,8 +481,6 @@ class RepeatedErrors:
                 f"bias of the accelerometers, estimated and subtracted: {shown} m/s^2, uncertain "
                 f"by {self.bias_error:.2g} m/s^2"
             )
-        if self.has_motion:
-            parts.append("errors of the motion of the base that would cause the residual")
         return "; ".join(parts)
 
 

@@ -36,10 +36,9 @@ def test_all_logs_together_have_48_stretches_of_ten_correlation_times_or_more(
 
 def test_errors_that_repeat_in_every_row_are_described_by_their_sizes():
     bias = np.array([0.1, -0.2, 0.003])
-    errors = RepeatedErrors(np.eye(2), 1.0, 0.0123, bias, bias_error=0.045, has_motion=True)
+    errors = RepeatedErrors(np.eye(2), 1.0, 0.0123, bias, bias_error=0.045)
     assert errors.described == (
         "points of contact uncertain by 0.012 m; bias of the accelerometers, estimated and "
-        "subtracted: +0.100, -0.200, +0.003 m/s^2, uncertain by 0.045 m/s^2; errors of the motion "
-        "of the base that would cause the residual"
+        "subtracted: +0.100, -0.200, +0.003 m/s^2, uncertain by 0.045 m/s^2"
     )
     assert RepeatedErrors(np.eye(2), 1.0, 0.0).described == ""
