@@ -13,12 +13,13 @@ from robotid.base.exceptions import (
     RankDeficientError,
     SettingsError,
 )
-from robotid.base.findings import Finding, not_ignored
+from robotid.base.findings import Finding, grouped, not_ignored
 from robotid.base.typing import ProgressCallback, ignore_progress, report_stage
 from robotid.data.files.columns import Needs
 from robotid.data.files.read import Readable, read_logs
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.explanations import explained
 from robotid.diagnosis.residual.discrepancies import explain_residual
 from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.residual.misfit import settled
@@ -133,20 +134,18 @@ def conclude(
         stated=StatedSettings(recordings.fitted[0].asked, friction, tuple(ignore)),
     )
     result = replace(result, scale=check_scale(result))
-    # logs of which the doctor found another payload
-    changes = [f.where for f in doctor_findings if f.code == "payload_change"]
-    with_payload = {where.rpartition(": ")[0] or where for where in changes}
     of_fit = [
         *fit_findings(fit, misfits, on_misfit, discrepancies),
         *unlike_findings(fit.variation),
-        *rescaled_findings(fit, with_payload),
+        *rescaled_findings(fit),
     ]
     # notes, and what the doctor says of excitation and logs, are replaced by those of the fit
     replaced = ("excitation", "log_assumption")
     others = [f for f in doctor_findings if f.severity != "note" and f.code not in replaced]
-    merged = settled(others, of_fit, ignore)
+    merged = settled(others, of_fit)
     merged = [finding for finding in merged if not explained_by_assumed(model, finding)]
     merged = rejected(merged, result.predictions, result.scale_check)
+    merged = explained(merged, model, ignore)
     log_errors = blocking(merged, ignore, is_robust=is_robust)
     heads = [log.head for log in (*recordings.fitted, *recordings.validation)]
     assumed = assumed_inertials(model)  # which the doctor finds, too, if it has run
@@ -158,7 +157,7 @@ def conclude(
     return replace(
         result,
         findings=tuple(findings),
-        log_errors=tuple(finding.message for finding in log_errors),
+        log_errors=tuple(m for cause in grouped(log_errors) for m in cause.messages),
         warnings=warnings_of(counted, model.joints, names, is_robust=is_robust),
     )
 

@@ -75,7 +75,7 @@ def choose_drives(
 def _drives(
     fit: Solution, sample: Sample, wanted: Mapping[str, Sequence[str] | None]
 ) -> dict[int, _Drive]:
-    """Return the drives whose families are stated or selected, by the index of their joint."""
+    """Return the drives whose families are given or selected, by the index of their joint."""
     model = fit.model.with_reference(sample.standard)
     motions = [drive_motion_along(model, x.trajectory) for x in sample.recordings]
     first = sample.weight.shape[1] - len(sample.joints)

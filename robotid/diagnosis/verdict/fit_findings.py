@@ -191,7 +191,7 @@ def not_written(log_errors: Sequence[Finding], inconsistent: str = "") -> Iterat
 
 
 def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]:
-    """Return a warning about locked joints whose positions matter but were not stated."""
+    """Return a warning about locked joints whose positions matter but were not given."""
     # A position matters on a chain with an identified joint; on a floating base all matter.
     relevant = set(model.locked) if model.free_flyer else _in_line(model)
     assumed = [name for name in model.locked if name not in stated and name in relevant]
@@ -442,7 +442,7 @@ def _unlike(name: str, unlike: UnlikeRun, others: int, rest: str) -> Finding:
     )  # fmt: skip
 
 
-def rescaled_findings(fit: Fit, loaded: Collection[str] = ()) -> Iterator[Finding]:
+def rescaled_findings(fit: Fit) -> Iterator[Finding]:
     """Yield a finding for each torque of a validation log that is a multiple of its prediction."""
     # The c of least |tau - c tau_predicted| of a poor prediction must remove most of its square.
     if fit.model.constraints:  # the rows are projected, and mix the joints
@@ -451,7 +451,7 @@ def rescaled_findings(fit: Fit, loaded: Collection[str] = ()) -> Iterator[Findin
     for e in fit.validation:
         motion, mask = e.recording.trajectory, e.recording.mask
         log = Path(e.recording.log.path).name
-        if e.is_refitted or e.recording.is_partial or log in loaded:
+        if e.is_refitted or e.recording.is_partial:
             continue
         for k, joint in enumerate(fit.model.row_names):
             measured = e.metrics["estimate"].per_joint.get(joint)

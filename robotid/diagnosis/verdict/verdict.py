@@ -387,7 +387,7 @@ def judge(
     }
     per_joint |= {joint: JointVerdict("not evaluated", (_HIDDEN,)) for joint in hidden}
     if cause_of is not None:
-        notes = [*_largest_error(per_joint, evidence, cause_of), *notes]
+        _explain_largest_error(per_joint, evidence, cause_of)
     errors = {joint: max(one.errors, default=0.0) for joint, one in evidence.items()}
     good = (
         f"torque prediction error on {logs_that_test(predictions.validation)}: at most "
@@ -411,19 +411,18 @@ def _ranked(reasons: Iterable[tuple[int, str]]) -> list[str]:
     return [text for _, text in sorted(reasons, key=lambda reason: reason[0])]
 
 
-def _largest_error(
+def _explain_largest_error(
     per_joint: dict[str, JointVerdict], evidence: Mapping[str, JointEvidence],
     cause_of: Callable[[str], tuple[str, str]],
-) -> list[str]:  # fmt: skip
-    """Add the cause to the good joint with the largest error; return it if all joints are good."""
+) -> None:  # fmt: skip
+    """Add the cause to the good joint with the largest error."""
     good = [joint for joint, verdict in per_joint.items() if verdict.status == "good"]
     if not good:
-        return []
+        return
     last = max(good, key=lambda joint: max(evidence[joint].errors))
     cause, advice = cause_of(last)
     text = f"largest error of the good joints: {'. '.join(filter(None, (cause, advice)))}"
     per_joint[last] = replace(per_joint[last], reasons=(*per_joint[last].reasons, text))
-    return [f"{last}: largest error: {cause}"] if len(good) == len(per_joint) else []
 
 
 def concluded(
@@ -486,17 +485,14 @@ def rejected(
     for one in findings:
         joints = [joint for joint in one.joints if joint in errors] or [*errors]
         worst = max((errors[joint] for joint in joints), default=np.inf)
-        is_rejected = one.code in _HYPOTHESES and worst < SMALL
-        if one.where == "all joints":
-            is_rejected = False  # it was found in the residual of the prediction
-        elif one.code == "current_for_torque":
-            ratios = [scale_check.gravity[j] for j in joints if j in scale_check.gravity]
-            is_rejected &= all(1 / _MUCH < ratio < _MUCH for ratio in ratios)
-        elif one.code == "gravity_compensated":
-            is_rejected &= scale_check.scale is not None and 1 / _MUCH < scale_check.factor < _MUCH
-        elif one.severity == "error":
-            is_rejected = False
-        if is_rejected:
+        gravity, total = scale_check.gravity, scale_check.factor
+        ratios = {
+            "current_for_torque": [gravity[joint] for joint in joints if joint in gravity],
+            "gravity_compensated": [np.inf if scale_check.scale is None else total],
+        }.get(one.code, [np.inf] if one.severity == "error" else [])
+        is_near = all(1 / _MUCH < ratio < _MUCH for ratio in ratios)
+        # one of all joints was found in the residual of the prediction
+        if one.code in _HYPOTHESES and one.where != "all joints" and worst < SMALL and is_near:
             logs = logs_that_test(validation)
             but = f"; rejected: torque error on {logs} at most {worst:.1f} %"
             one = one.reworded(severity="note", remedy=one.remedy + but)
