@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.diagnosis.decisions import ZERO
+from robotid.diagnosis.decisions import EXACT, ZERO
 from robotid.diagnosis.logs.probe import Probe, drive_columns
 from robotid.dynamics.constraint_rows import constraint_jacobian, force_basis, without_forces
 from robotid.dynamics.rows import inertial_rows, joint_constants
@@ -31,7 +31,6 @@ _ALIKE = 1.0  # difference of misfits below which two readings explain a log equ
 EXPLAINED = 0.1  # unexplained share of a torque below which a reading explains it
 _POOR = 0.0005  # unexplained share of a torque from which other readings are tried ...
 _GROSS = 0.05  # ... and from which other directions of the axes are tried
-_FLOOR = 1e-5  # an unexplained share below this is rounding
 _LOOSE = 10.0  # prior deviation of the bodies, in sizes of the URDF's
 _FEW = 24  # instants with which the readings are chosen that are tried with all
 _SEGMENTS = 8  # of the log that are held out in turn
@@ -97,11 +96,11 @@ class _Motion:
             urdf = X @ pi - self.subtracted * (weight @ pi)
         joints = np.arange(n - len(self.model.joints), n)
         every = drive_columns(self.model, self.q, self.v[:, joints], self.a[:, joints])
+        level = np.sqrt(np.mean(self.tau**2, axis=0).max())
+        every *= level / (np.sqrt(np.mean(every**2, axis=0)) + EXACT)
         drive = np.zeros((N, n, every.shape[2]))
         drive[:, joints] = every
         coupled, drive = drive[:, reach, _DRIVE:], drive[:, rows, :_DRIVE]
-        level = np.sqrt(np.mean(self.tau**2, axis=0).max())
-        drive *= level / (np.sqrt(np.mean(drive**2, axis=0)) + _FLOOR)
         bodies = (X * self.spread[self.moved])[..., self.spread[self.moved] > 0.0]
         logged = np.repeat(self.tau[:, None], len(rows), axis=1)
         if self.basis is not None:
@@ -128,7 +127,7 @@ class _Motion:
         """Squared variation of each torque, without unknown forces, (n,); 0 if constant."""
         tau = self.tau if self.basis is None else without_forces(self.basis, self.tau)
         squares = np.sum((tau - tau.mean(axis=0)) ** 2, axis=0)
-        return np.where(squares > _FLOOR**2 * np.sum(self.tau**2, axis=0), squares, 0.0)
+        return np.where(squares > EXACT**2 * np.sum(self.tau**2, axis=0), squares, 0.0)
 
     @cached_property
     def reach(self) -> Array:
@@ -243,7 +242,7 @@ class Samples:
 
 def misfit(share: Array) -> float:
     """Return the sum of the logarithms of unexplained shares: lower is better."""
-    return float(np.sum(np.log(np.minimum(share, 1.0) + _FLOOR)))
+    return float(np.sum(np.log(np.minimum(share, 1.0) + EXACT)))
 
 
 def _over(left: Array, size: Array) -> Array:
@@ -273,7 +272,7 @@ def _fitted(motion: _Motion, products: Array, size: Array) -> Array:
     noise, x = EXPLAINED * size, np.zeros((m, c))
     A, b = np.zeros((p + _DRIVE * m,) * 2), np.zeros(p + _DRIVE * m)
     for _ in range(2):
-        weight = len(motion.q) / np.where(size > 0.0, noise + _FLOOR * size, np.inf)
+        weight = len(motion.q) / np.where(size > 0.0, noise + EXACT * size, np.inf)
         weighted = weight[:, None, None] * products
         if is_projected:
             A[:], b[:] = weighted[:, :c, :c].sum(axis=0), weighted[:, :c, c].sum(axis=0)
@@ -283,7 +282,7 @@ def _fitted(motion: _Motion, products: Array, size: Array) -> Array:
             A[own[:, :, None], own[:, None]] = weighted[:, p:c, p:c]
             b[:p], b[own] = weighted[:, :p, c].sum(axis=0), weighted[:, p:c, c]
         diagonal = np.diagonal(A).copy()
-        np.fill_diagonal(A, (1.0 + _FLOOR**2) * diagonal + 1.0)
+        np.fill_diagonal(A, (1.0 + EXACT**2) * diagonal + 1.0)
         L = dpotrf(A, lower=True)[0]
         y = dtrtrs(L, b, lower=True)[0]
         d = nnls(L[first:, first:].T, y[first:])[0]
@@ -312,7 +311,7 @@ class Reading:
         """Yield the reading of one value at which parabolas through three shares are low."""
         low, high = (self.apply(samples, x).share for x in (-self.step, self.step))
         before, slope = samples.share, 0.5 * (high - low)
-        curvature, weight = 0.5 * (high + low) - before, 1.0 / (before + _FLOOR)
+        curvature, weight = 0.5 * (high + low) - before, 1.0 / (before + EXACT)
         least = weight @ curvature
         x = float(-0.5 * (weight @ slope) / least if least > 0.0 else -np.sign(weight @ slope))
         lowest = np.maximum(before + slope * x + curvature * x**2, 0.0)
@@ -384,7 +383,7 @@ def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
         at = np.isin(rows, group)
         if m.basis is None and samples.urdf_size[at].any():  # by the ratio to the URDF's torques
             ratio = np.sum(m.tau[:, m.rows[at]] ** 2) / samples.urdf_size[at].sum()
-            yield replace(scaled, values=(0.5 * float(np.log(ratio + _FLOOR)),))
+            yield replace(scaled, values=(0.5 * float(np.log(ratio + EXACT)),))
     for j in turning:
         shifted = Reading("position_offset", (j,), partial(_shifted, on=place[j]), (), 0.1)
         if m.basis is not None:
@@ -486,7 +485,7 @@ def _with_sign(samples: Samples, j: int) -> Array:
     own, size = replace(m, rows=np.array([j])), np.abs(m.tau[:, column])
     bodies = own.inertial()[:, 0] @ m.model.standard_parameters()[own.moved]
     X = np.column_stack([bodies, drive_columns(m.model, m.q, m.v, m.a)[:, j]])
-    X /= np.linalg.norm(X, axis=0) + _FLOOR
+    X /= np.linalg.norm(X, axis=0) + EXACT
     tried = []
     for sign in (np.sign(bodies), np.sign(m.v[:, j]), np.sign(m.a[:, j])):
         for _ in range(_TRIED):

@@ -85,9 +85,8 @@ def test_a_joint_that_moves_is_named_and_leads_the_verdict(job, tmp_path):
     moving = replace(moving, **{part: (entry,) for part, entry in parts.items()})
     identification, _ = run_job(moving, tmp_path / "out")
     assert ["is locked" in x for x in identification.verdict.reasons].index(False) == 1
-    (step, *_) = next_steps(identification, Origin(("job.toml",)))
-    assert "identify wrist_3_joint, too" in step.words
-    assert not step.blocks
+    step = next_steps(identification, Origin(("job.toml",)))[0]
+    assert ("identify wrist_3_joint, too" in step.words, step.blocks) == (True, ())
 
 
 def test_positions_and_ranges_have_the_unit_of_their_joint():
