@@ -202,12 +202,10 @@ def _slopes(model: RobotModel, rows: Rows, pi: Array, points: Sequence[int]) -> 
 
 def _slopes_of_bias(model: RobotModel, rows: Rows, pi: Array) -> Array:
     """Return the rows' torque per acceleration of the base, shape (N n_rows, 3) [N s^2/m]."""
-    motion = replace(rows.trajectory, basis=None)
+    motion = rows.trajectory
     (torque,) = predict(model, [pi], motion)
     pushed = [replace(motion, a=motion.a + np.eye(1, model.n_rows, k)) for k in range(3)]
     D = np.stack([predict(model, [pi], x)[0] - torque for x in pushed], axis=2)
-    if rows.trajectory.basis is not None:
-        D = without_forces(rows.trajectory.basis, D)
     return D.reshape(-1, 3)
 
 

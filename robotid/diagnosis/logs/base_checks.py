@@ -31,12 +31,7 @@ from robotid.diagnosis.decisions import (
     NOTHING,
     ROWS,
 )
-from robotid.dynamics.constraint_rows import (
-    constraint_jacobian,
-    force_basis,
-    touching,
-    without_forces,
-)
+from robotid.dynamics.constraint_rows import constrained, constraint_jacobian
 from robotid.dynamics.prepared_logs import closed_log, with_contacts
 from robotid.dynamics.torque import predict
 from robotid.robot.constraints import Contact, link_positions
@@ -92,14 +87,13 @@ def check_wrenches(model: RobotModel, log: str, motion: Trajectory) -> Iterator[
     # W pi = J^T f in the rows of a floating base, less unknown forces, is clearly better fulfilled.
     if motion.wrenches is None or not any(x.measured for x in model.contacts):
         return
-    every = max(1, len(motion.t) // ROWS)
-    wrenches, motion = motion.wrenches[::every], motion.every(every)
-    (torque,) = predict(model, [model.standard_parameters()], motion)
+    motion = motion.every(max(1, len(motion.t) // ROWS))
     g = float(np.linalg.norm(model.pin_model.gravity.linear))
     weight = sum(x.mass for x in model.pin_model.inertias) * g
-    J, basis = _base_rows(model, motion)
-    caused = without_forces(basis, np.einsum("kmj,km->kj", J, wrenches))
-    left = without_forces(basis, torque[:, :6])
+    of_base = np.broadcast_to(np.arange(model.n_rows) < 6, motion.v.shape)
+    known, _ = constrained(model, replace(motion, tau=0.0 * motion.v), of_base)
+    (torque,) = predict(model, [model.standard_parameters()], known)
+    caused, left = known.tau[:, :6], torque[:, :6]
     factor = float(np.sum(caused * left)) / max(float(np.sum(caused**2)), NOTHING)
     factors = {"reversed": -1.0, "kN": 1e3, "kgf": _G, "unit": factor}
     errors = {what: rms((left - x * caused)[:, :3]) for what, x in factors.items()}
@@ -109,18 +103,6 @@ def check_wrenches(model: RobotModel, log: str, motion: Trajectory) -> Iterator[
         at = what if what == "reversed" else "unit"
         best, factor = errors[at], factors[at]
         yield finding("measured_wrench", log, what=what, force=stated, best=best, factor=factor)
-
-
-def _base_rows(model: RobotModel, motion: Trajectory) -> tuple[Array, Array]:
-    """Return the rows of the base per measured component, (N, m, 6), and of unknown forces."""
-    J = constraint_jacobian(model, motion.q, touching(model, motion))[:, :, :6]
-    known, first = list[int](), 0
-    for x in model.constraints:
-        if isinstance(x, Contact):
-            known += [first + k for k in x.rows_measured]
-        first += x.sizes[x.kind]
-    used = np.ones((len(J), 6), dtype=bool)
-    return J[:, known], force_basis(np.delete(J, known, axis=1), used, floats=True)
 
 
 def _check_feet(model: RobotModel, log: Log, whole: Log, motion: Trajectory) -> Iterator[Finding]:

@@ -43,8 +43,7 @@ _DRIVE = 4  # columns of a drive: offset, armature, viscous and Coulomb friction
 
 def limbs(model: RobotModel) -> list[tuple[Array, bool]]:
     """Return groups of joints that are explained together, and whether other readings are tried."""
-    # Those that carry few bodies, connected by these bodies; last those that carry more. Forces of
-    # contacts connect all joints.
+    # Those that carry few bodies, connected by these bodies or by contacts; last those with more.
     joints = np.arange(model.n_rows - len(model.joints), model.n_rows)
     carries = model.support[:, : model.layout.n_inertial : 10]
     if model.constraints:
@@ -94,19 +93,16 @@ class _Motion:
             gravity, inertia = (x[reach, None] for x in (self.gravity, self.inertia))
             X = inertia * (X - weight) + gravity * weight
             urdf = X @ pi - self.subtracted * (weight @ pi)
-        joints = np.arange(n - len(self.model.joints), n)
-        every = drive_columns(self.model, self.q, self.v[:, joints], self.a[:, joints])
+        k = len(self.model.joints)
+        every = drive_columns(self.model, self.q, self.v[:, -k:], self.a[:, -k:])
         level = np.sqrt(np.mean(self.tau**2, axis=0).max())
         every *= level / (np.sqrt(np.mean(every**2, axis=0)) + EXACT)
-        drive = np.zeros((N, n, every.shape[2]))
-        drive[:, joints] = every
+        drive = np.pad(every, ((0, 0), (n - k, 0), (0, 0)))
         coupled, drive = drive[:, reach, _DRIVE:], drive[:, rows, :_DRIVE]
         bodies = (X * self.spread[self.moved])[..., self.spread[self.moved] > 0.0]
         logged = np.repeat(self.tau[:, None], len(rows), axis=1)
         if self.basis is not None:
-            own = np.zeros((N, _DRIVE, len(rows), n))
-            own[:, :, np.arange(len(rows)), rows] = drive.swapaxes(1, 2)
-            drive = own.reshape(N, -1, n).swapaxes(1, 2)
+            drive = np.einsum("kjd,ji->kidj", drive, np.eye(n)[rows]).reshape(N, n, -1)
             logged = self.tau[:, None] * np.eye(n)
         P = np.concatenate([bodies, coupled, drive, urdf[..., None], logged], axis=2)
         P = (P if self.basis is None else without_forces(self.basis, P)[:, rows]).swapaxes(0, 1)
@@ -171,8 +167,7 @@ class Samples:
     def few(self) -> "Samples":
         """Return some of the instants, in one segment, with bodies nearer the URDF's."""
         step = max(1, len(self.motion.q) // _FEW)
-        channels = ("q", "v", "a", "tau", "contacts")
-        some = {key: getattr(self.motion, key)[::step] for key in channels}
+        some = {x: getattr(self.motion, x)[::step] for x in ("q", "v", "a", "tau", "contacts")}
         few = self.changed(segments=1, spread=self.motion.spread / _LOOSE, **some)
         return few.changed(size=(self.motion.size > 0.0) * few.motion.variation)
 
@@ -184,10 +179,8 @@ class Samples:
     def unsigned(self) -> tuple[int, ...]:
         """The joints of the limb with torques that vary and are never negative."""
         m = self.motion
-        if m.basis is not None:  # a leg that stands has torques of one sign
-            return ()
         low, high = m.tau.min(axis=0), m.tau.max(axis=0)
-        is_unsigned = (m.size > 0.0) & (low >= -ZERO * high)
+        is_unsigned = (m.size > 0.0) & (low >= -ZERO * high) & (m.basis is None)  # standing legs
         return tuple(j for j in m.rows.tolist() if is_unsigned[self.order[j]])
 
     @cached_property
@@ -429,8 +422,7 @@ def _shifted(samples: Samples, offset: float, on: Array) -> Samples:
 def _reordered(samples: Samples, order: tuple[int, ...]) -> Samples:
     if samples.motion.basis is not None:  # columns of all joints enter each row
         return samples.changed(tau=samples.motion.tau[:, order])
-    at = list(order)
-    return replace(samples, order=samples.order[at], sign=samples.sign[at])
+    return replace(samples, order=samples.order[list(order)], sign=samples.sign[list(order)])
 
 
 @lru_cache(maxsize=1)  # for two readings

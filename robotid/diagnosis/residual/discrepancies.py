@@ -194,25 +194,16 @@ class _Alteration:
             "angle_scale": {
                 "factor": 1 + x[0],
                 "named": f"q_{joint}" if joint else "every position",
-                "what": "residual",
-                "cure": "residual",
             },
             "torque_scale": {"factor": 1 + x[0], "what": sense, "cure": sense},
-            "time_scale": {
-                "factor": 1 + x[0],
-                "speed": np.sqrt(max(1 + x[0], 0.0)),
-                "what": "residual",
-                "cure": "residual",
-            },
+            "time_scale": {"factor": 1 + x[0], "speed": np.sqrt(max(1 + x[0], 0.0))},
             "joint_origin": {"named": joint or "a joint"},
             "external_force": {"what": "constant", "cure": "constant"},
         }
-        more, applied = values.get(self.reading.code, {}), self.reading.applied
-        if applied is not None:
-            more |= {"what": "residual", "cure": "residual"}
-            if self.reading.code == "gravity":
-                g = applied(self.on, x)[0].pin_model.gravity.linear
-                more["best"] = ", ".join(f"{value:.2f}" for value in g)
+        more = {"what": "residual", "cure": "residual"} | values.get(self.reading.code, {})
+        if self.reading.code == "gravity" and self.reading.applied is not None:
+            g = self.reading.applied(self.on, x)[0].pin_model.gravity.linear
+            more["best"] = ", ".join(f"{value:.2f}" for value in g)
         return more
 
 

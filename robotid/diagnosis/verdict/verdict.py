@@ -134,8 +134,7 @@ class Predictions:
     def why_untested(self, joint: str) -> str:
         """Return why a joint was evaluated on no validation log."""
         if joint in self.fitted and not self.validation:
-            given = "the validation logs contain fitted samples"
-            return given if self.refitted else "no validation log given"
+            return "all logs contain fitted samples" if self.refitted else "no validation log given"
         logs = "validation log" if joint in self.fitted else "recording"
         return f"it does not move in any {logs}"
 

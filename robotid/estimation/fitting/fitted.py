@@ -43,7 +43,7 @@ from robotid.robot.bodies import held_parameters
 from robotid.robot.drive_term import DriveMotion
 from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
-from robotid.robot.parameters import INERTIAL_TERMS, pseudo_inertia
+from robotid.robot.parameters import pseudo_inertia
 
 SOURCES = ("data", "mixed", "prior", "bound")  # of the value of a standard parameter
 #: Standard error over prior standard deviation below which the source is the data (a change above
@@ -114,10 +114,9 @@ class Identified(ABC):
         half, layout = self.standard_quantile * self.standard_error, self.model.layout
         low = self.standard - half
         if self.is_consistent:
-            bounded = layout.is_nonnegative()
-            of_body = np.isin(INERTIAL_TERMS, ("m", "Ixx", "Iyy", "Izz"))
-            bounded[: layout.n_inertial] = np.tile(of_body, len(layout.bodies))
-            low = np.where(bounded & np.isfinite(half), np.maximum(low, 0.0), low)
+            is_size = [x.endswith((".m", ".Ixx", ".Iyy", ".Izz")) for x in layout.names]
+            bounded = np.isfinite(half) & (is_size | layout.is_nonnegative())
+            low = np.where(bounded, np.maximum(low, 0.0), low)
         return np.column_stack([low, self.standard + half])
 
     @property
