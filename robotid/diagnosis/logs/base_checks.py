@@ -71,8 +71,7 @@ def examine_base(
         return findings + wrong, None
     findings += twist
     findings += [finding("log_note", log.name, text=x) for x in whole.notes[len(log.notes) :]]
-    wrong = [] if imu is None else list(check_imu(whole, motion))
-    findings += wrong
+    findings += (wrong := [] if imu is None else list(check_imu(whole, motion)))
     is_turned = any(one.code in ("imu_axes", "base_orientation") for one in wrong)
     if not model.contacts or is_turned:
         return findings, None

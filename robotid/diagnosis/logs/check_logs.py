@@ -55,8 +55,7 @@ def diagnose(
     _examine_torques(model, [one for one in examined if one.is_tried], signals)
     findings = [*assumed_inertials(model), *(x for one in examined for x in one.findings)]
     first = [one.motion for one in examined[: len(fitted)] if one.motion is not None]
-    known = [] if model.constraints else examined[: len(fitted)]
-    probes = [one.probe for one in known if one.probe is not None]
+    probes = [x.probe for x in examined[: len(fitted)] if x.probe and not model.constraints]
     mapping = structural_mapping(model) if probes else None
     for k, log in enumerate(fitted):
         same = [x.name for x in fitted[:k] if np.array_equal([x.q, x.tau], [log.q, log.tau])]

@@ -107,10 +107,8 @@ class Identified(ABC):
 
     @property
     def standard_interval(self) -> Array:
-        """95 % interval of each standard parameter, shape (p, 2); infinite if there is none.
-
-        Of a consistent fit, it contains no negative mass, moment of inertia or friction.
-        """
+        """95 % interval of each standard parameter, shape (p, 2); infinite if there is none."""
+        # of a consistent fit, none contains a negative mass, moment of inertia or friction
         half, layout = self.standard_quantile * self.standard_error, self.model.layout
         low = self.standard - half
         if self.is_consistent:
