@@ -30,7 +30,6 @@ SECONDS = 5.0  # [s] of the averaged spectra, and least total time of constant c
 EXCITED = 1e-4  # least power of a command, over that of its strongest frequency
 _LONGEST = 0.5  # [s] longest delay, or lead, of a position; a joint has settled after it
 _INTERVAL = 0.05  # [s] over which signals are averaged to compare their changes
-_SLOW = 5.0  # [lags] least duration of slow sweeps
 _RESOLVED = 10.0  # least number of encoder steps in a sweep, and of rows per period
 
 
@@ -180,8 +179,8 @@ class _Loop:
         moves = np.flatnonzero(np.diff(self.command) != 0)
         reversals = moves[1:][np.diff(np.sign(np.diff(self.command)[moves])) != 0]
         lag = max(self.lag[0], 0.0) if np.isfinite(self.lag[0]) else 0.0
-        least, delay = max(_SLOW * lag, _LONGEST / 2), round(lag / self.step)  # [s], [samples]
-        slow = [(i, k) for i, k in pairwise(reversals.tolist()) if (k - i) * self.step > least]
+        delay = round(lag / self.step)  # [samples]
+        slow = [(i, k) for i, k in pairwise(reversals.tolist()) if (k - i) * self.step > _LONGEST]
         swept = np.array([abs(self.command[k] - self.command[i]) for i, k in slow])
         followed = np.array([np.ptp(self.q[i : k + delay + 1]) for i, k in slow])
         is_large = swept > 2 * DIFFERS * swept.max(initial=0.0)
