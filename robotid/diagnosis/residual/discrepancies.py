@@ -355,11 +355,10 @@ def _accepted(
 ) -> Iterator[tuple[_Alteration, Finding, Sample]]:
     """Yield the alterations that explain the residual, findings, and the corrected samples."""
     trials, offered = Trials.of(sample, possible)
-
-    def complexity(one: _Alteration) -> tuple[int, int]:
-        return len(offered[one]), len(one.joints)  # number of sizes, and of joints named
-
-    for accepted in trials.accepted(offered, decisions.ALTERATION, complexity):
+    for accepted in trials.accepted(
+        offered, decisions.ALTERATION,
+        lambda one: (len(offered[one]), len(one.joints)),  # number of sizes, and of joints named
+    ):  # fmt: skip
         best, size, error = accepted.option, accepted.theta, np.sqrt(np.diag(accepted.covariance))
         least = best.reading.least * _needed(accepted)
         if np.linalg.norm(size) < max(least, decisions.SIGNIFICANT * float(np.linalg.norm(error))):
