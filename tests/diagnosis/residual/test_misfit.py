@@ -260,34 +260,29 @@ def test_a_term_stands_for_what_the_doctor_guessed_of_its_torque(three):
 def test_a_finding_of_the_fit_is_a_note_while_a_reading_of_its_joints_stands():
     # the first two joints carry a common body, the last one is of another arm
     support = np.repeat([[True, True, False], [False, True, False], [False, False, True]], 10, 1)
-    robot = SimpleNamespace(
-        joints=(PAN, LIFT, "other"), support=support, layout=SimpleNamespace(n_inertial=30)
-    )
+    joints, layout = (PAN, LIFT, "other"), SimpleNamespace(n_inertial=30)
+    robot = SimpleNamespace(joints=joints, support=support, layout=layout)
 
     def doctor_finding(code, joint="", severity="error", log="a.csv"):
         return Finding(code, severity, "", "It is.", log=log, joints=(joint,) if joint else ())
 
-    def fit_finding(code, joint):
-        return doctor_finding(code, joint, "warning", "")
-
-    terms = [fit_finding("coupling", joint) for joint in robot.joints]
+    terms = [doctor_finding("coupling", joint, "warning", "") for joint in joints]
 
     def said(*findings, ignore=()):
-        severities = [one.severity for one in explained(findings, robot, ignore)]
-        return "".join("-" if x == "note" else x[0] for x in severities)
+        return "".join(one.severity[0] for one in explained(findings, robot, ignore))
 
     assert said(*terms) == "www"
     for code in ("current_for_torque", "torque_sign", "drive_off", "position_sign"):
-        assert said(doctor_finding(code, PAN), *terms) == "e--w"
+        assert said(doctor_finding(code, PAN), *terms) == "ennw"
     assert said(doctor_finding("torque_sign", PAN), *terms, ignore=("torque_sign",)) == "ewww"
-    assert said(doctor_finding("torque_delay", "", "warning"), *terms) == "w---"
+    assert said(doctor_finding("torque_delay", "", "warning"), *terms) == "wnnn"
     # what names no cause explains nothing, and a finding of a validation log rests on the fit
     gain = doctor_finding("gain_change", LIFT, "warning", "b.csv")
-    assert said(doctor_finding("unexplained_torque", PAN, "warning"), terms[0], gain) == "ww-"
+    assert said(doctor_finding("unexplained_torque", PAN, "warning"), terms[0], gain) == "wwn"
     assert said(doctor_finding("urdf_mismatch"), doctor_finding("joint_axis", PAN)) == "e"
     # of one channel: the columns are exchanged, or it has another unit and its sign is no evidence
-    order, far = doctor_finding("torque_order", PAN), doctor_finding("beyond_effort", PAN)
-    sign = doctor_finding("torque_sign", PAN)
+    codes = ("torque_order", "beyond_effort", "torque_sign")
+    order, far, sign = (doctor_finding(code, PAN) for code in codes)
     kept = [explained([far, other], robot) for other in (order, sign)]
     assert (kept, said(order, sign)) == ([[order], [far]], "ee")
     for other in (replace(sign, joints=(LIFT,)), replace(sign, log="b.csv")):
