@@ -386,12 +386,11 @@ def _needed(accepted: Accepted[_Alteration]) -> float:
     share, confirmed = accepted.share, accepted.confirmed
     if accepted.p_value > decisions.P_VALUE:
         return np.inf
-    if share >= decisions.LEAST_SHARE:
-        is_confirmed = confirmed is None or confirmed > decisions.CONFIRMED * share
-        return 1.0 if is_confirmed else np.inf
+    is_confirmed = confirmed is None or confirmed > decisions.CONFIRMED * share
+    if share >= decisions.LEAST_SHARE and is_confirmed:
+        return 1.0
     is_weak = confirmed is not None and confirmed > share > decisions.WEAK
-    is_weak = is_weak and accepted.p_value < decisions.WEAK_P_VALUE
-    return decisions.WEAK_SIZE if is_weak else np.inf
+    return decisions.WEAK_SIZE if is_weak and accepted.p_value < decisions.WEAK_P_VALUE else np.inf
 
 
 def _refined(

@@ -437,17 +437,14 @@ def rescaled_findings(fit: Fit) -> Iterator[Finding]:
     if fit.model.constraints:  # the rows are projected, and mix the joints
         return
     friction = dict[str, float]()
-    for e in fit.validation:
+    for e in (e for e in fit.validation if not (e.is_refitted or e.recording.is_partial)):
         motion, mask = e.recording.trajectory, e.recording.mask
         log = Path(e.recording.log.path).name
-        if e.is_refitted or e.recording.is_partial:
-            continue
         for k, joint in enumerate(fit.model.row_names):
             measured = e.metrics["estimate"].per_joint.get(joint)
-            if joint not in fit.model.joints or measured is None:
-                continue
-            if not GOOD < error_of(measured) < np.inf:  # inf: a torque of 0 has no gain
-                continue
+            error = 0.0 if measured is None else error_of(measured)
+            if joint not in fit.model.joints or not GOOD < error < np.inf:
+                continue  # inf: a torque of 0 has no gain
             tau, predicted = motion.tau[mask[:, k], k], e.torques["estimate"][mask[:, k], k]
             factor = float(predicted @ tau) / max(float(predicted @ predicted), decisions.NOTHING)
             left = float(np.sum((tau - factor * predicted) ** 2) / np.sum((tau - predicted) ** 2))
