@@ -142,7 +142,25 @@ def _of_robot(
             "axis_direction:residual", 0.03, one,
             lambda on: by.by_axis[:, :, on > 0].reshape(shape),
         ),
+        Reading(
+            "axis_direction:residual", 0.03, [] if model.layout.prismatic else one,
+            lambda on: _turned_alone(model, by, int(on.argmax())),
+        ),
     )  # fmt: skip
+
+
+def _turned_alone(model: RobotModel, by: TorqueSlopes, j: int) -> Array:
+    """Return the derivative by turning a joint's axis, not what it carries, shape (N, n, 2)."""
+    axes = {joint.name: joint.axis for joint in model.tree.joints}
+    axis = np.array([axes[name] for name in model.joints])  # (n, 3)
+    across = np.stack([np.linalg.svd([x])[2][1:] for x in axis])  # (n, 2, 3)
+    engine, Z = model.pin_model, by.by_axis[:, :, j].copy()
+    for k in (k for k in range(len(axis)) if engine.parents[k + 1] == j + 1):
+        place = engine.jointPlacements[k + 1]  # it turns back about the origin of joint j
+        back = across[j] @ place.rotation  # (2, 3), in the frame of joint k
+        Z -= by.by_origin[:, :, k] @ np.cross(across[j], place.translation).T
+        Z -= by.by_axis[:, :, k] @ across[k] @ back.T + by.by_q[:, :, k, None] * (back @ axis[k])
+    return Z
 
 
 def _still(at: Sequence[Trajectory]) -> list[Trajectory]:
@@ -188,22 +206,25 @@ class _Alteration:
         """Return the values of the finding for sizes (c,)."""
         joint, is_one = "".join(self.joints[:1]), len(self.joints) == 1
         sense = "one" if is_one else "more" if x[0] > 0 else "less"
+        residual: dict[str, float | str] = {"what": "residual", "cure": "residual"}
+        factor: dict[str, float | str] = {"factor": 1 + x[0]}
         values: dict[str, dict[str, float | str]] = {
             "position_offset": {"correction": -x[0], "unit": unit},
             "lost_motion": {"unit": unit},
-            "angle_scale": {
-                "factor": 1 + x[0],
-                "named": f"q_{joint}" if joint else "every position",
-            },
-            "torque_scale": {"factor": 1 + x[0], "what": sense, "cure": sense},
-            "time_scale": {"factor": 1 + x[0], "speed": np.sqrt(max(1 + x[0], 0.0))},
+            "angle_scale": factor
+            | residual
+            | {"named": f"q_{joint}" if joint else "every position"},
+            "torque_scale": factor | {"what": sense, "cure": sense},
+            "time_scale": factor | residual | {"speed": np.sqrt(max(1 + x[0], 0.0))},
             "joint_origin": {"named": joint or "a joint"},
             "external_force": {"what": "constant", "cure": "constant"},
         }
-        more = {"what": "residual", "cure": "residual"} | values.get(self.reading.code, {})
-        if self.reading.code == "gravity" and self.reading.applied is not None:
-            g = self.reading.applied(self.on, x)[0].pin_model.gravity.linear
-            more["best"] = ", ".join(f"{value:.2f}" for value in g)
+        more, applied = values.get(self.reading.code, {}), self.reading.applied
+        if applied is not None:
+            more |= residual
+            if self.reading.code == "gravity":
+                g = applied(self.on, x)[0].pin_model.gravity.linear
+                more["best"] = ", ".join(f"{value:.2f}" for value in g)
         return more
 
 
@@ -336,11 +357,10 @@ def _accepted(
 ) -> Iterator[tuple[_Alteration, Finding, Sample]]:
     """Yield the alterations that explain the residual, findings, and the corrected samples."""
     trials, offered = Trials.of(sample, possible)
-
-    def complexity(one: _Alteration) -> tuple[int, int]:
-        return len(offered[one]), len(one.joints)  # number of sizes, and of joints named
-
-    for accepted in trials.accepted(offered, decisions.ALTERATION, complexity):
+    for accepted in trials.accepted(
+        offered, decisions.ALTERATION,
+        lambda one: (len(offered[one]), len(one.joints)),  # number of sizes, and of joints named
+    ):  # fmt: skip
         best, size, error = accepted.option, accepted.theta, np.sqrt(np.diag(accepted.covariance))
         least = best.reading.least * _needed(accepted)
         if np.linalg.norm(size) < max(least, decisions.SIGNIFICANT * float(np.linalg.norm(error))):
@@ -349,14 +369,14 @@ def _accepted(
         if best.reading.applied is not None and len(accepted.columns) == len(size):
             applied = partial(best.reading.applied, best.on)
             size, error, corrected = _refined(applied, size, fit.standard, sample)
-        others = [one for one in accepted.others if one.joints]
+        others = [(one.reading.code, one.joints) for one in accepted.others if one.joints]
         unit = "m" if fit.model.layout.prismatic.intersection(best.joints) else "rad"
         norm, norm_error = float(np.linalg.norm(size)), float(np.linalg.norm(error))
         angle, angle_error = np.degrees(np.arctan([norm, norm_error]))
         explained = finding(
             best.reading.code, "", best.joints, subject="" if best.joints else "all joints",
             severity="warning", explained=True, also=bool(others),
-            others=listed(f"{one.reading.code} of {', '.join(one.joints)}" for one in others),
+            others=listed(f"{x.partition(':')[0]} of {', '.join(joints)}" for x, joints in others),
             size=float(size[0] if len(size) == 1 else norm), share_pct=100 * accepted.share,
             std_error=norm_error, angle=angle, angle_error=angle_error, **best.values(size, unit),
         )  # fmt: skip
@@ -368,12 +388,11 @@ def _needed(accepted: Accepted[_Alteration]) -> float:
     share, confirmed = accepted.share, accepted.confirmed
     if accepted.p_value > decisions.P_VALUE:
         return np.inf
-    if share >= decisions.LEAST_SHARE:
-        is_confirmed = confirmed is None or confirmed > decisions.CONFIRMED * share
-        return 1.0 if is_confirmed else np.inf
+    is_confirmed = confirmed is None or confirmed > decisions.CONFIRMED * share
+    if share >= decisions.LEAST_SHARE and is_confirmed:
+        return 1.0
     is_weak = confirmed is not None and confirmed > share > decisions.WEAK
-    is_weak = is_weak and accepted.p_value < decisions.WEAK_P_VALUE
-    return decisions.WEAK_SIZE if is_weak else np.inf
+    return decisions.WEAK_SIZE if is_weak and accepted.p_value < decisions.WEAK_P_VALUE else np.inf
 
 
 def _refined(
