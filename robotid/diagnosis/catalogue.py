@@ -31,7 +31,7 @@ def codes_with(key: str) -> tuple[str, ...]:
 
 def is_cause(code: str) -> bool:
     """Return whether a finding names a cause of a residual."""
-    return code == "gain_change" or entries()[code]["page"] in ("residual", "torques")
+    return entries()[code]["page"] in ("residual", "torques")
 
 
 def step_of(code: str) -> str:

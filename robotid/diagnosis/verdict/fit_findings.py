@@ -12,12 +12,11 @@ from robotid.base.tolerances import TINY
 from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import DIFFERS, NO_ERROR_OF_MASSES, SHARE_OF_ROWS, TENFOLD
+from robotid.diagnosis.decisions import NO_ERROR_OF_MASSES, SHARE_OF_ROWS, TENFOLD
 from robotid.diagnosis.residual.misfit import Misfit, misfit_finding
 from robotid.diagnosis.urdf.inertials import audit_bodies
 from robotid.diagnosis.verdict.parameter_table import correlated_parameters
-from robotid.diagnosis.verdict.scale_check import friction_shares
-from robotid.diagnosis.verdict.verdict import BEATEN, GOOD, NAMED, SMALL, error_of, is_harmless_cost
+from robotid.diagnosis.verdict.verdict import BEATEN, NAMED, SMALL, is_harmless_cost
 from robotid.estimation.estimators.consistent_fit import slabs
 from robotid.estimation.fitting.estimator_settings import BoundedSettings, ConsistentSettings
 from robotid.estimation.fitting.fitted import CLEARLY, Fit
@@ -43,8 +42,6 @@ _DENSEST = 12_000.0  # [kg/m^3] of a link: lead has 11,340
 _UNLIKELY = 0.05  # share of the bodies that the errors allow below which one is not possible
 _AT_BOUND = 1e-3  # relative difference of a mass from a stated bound that determines it
 _VANISHED = 0.05  # share of a link's URDF mass below which the link has practically vanished
-_LEFT = 1 / 3  # largest share of the squared error that a gain of the torque leaves
-_MOSTLY = 0.6  # share of friction in a torque above which friction may have changed, too
 
 
 def fit_findings(
@@ -438,32 +435,3 @@ def _unlike(name: str, unlike: UnlikeRun, others: int, rest: str) -> Finding:
         size=size, range=span, value=unlike.value, std_error=unlike.std_error, low=low, high=high,
         probability=unlike.probability,
     )  # fmt: skip
-
-
-def rescaled_findings(fit: Fit, loaded: Collection[str] = ()) -> Iterator[Finding]:
-    """Yield a finding for each torque of a validation log that is a multiple of its prediction."""
-    # The c of least |tau - c tau_predicted| of a poor prediction must remove most of its square.
-    if fit.model.constraints:  # the rows are projected, and mix the joints
-        return
-    friction = dict[str, float]()
-    for e in fit.validation:
-        motion, mask = e.recording.trajectory, e.recording.mask
-        log = Path(e.recording.log.path).name
-        if e.is_refitted or e.recording.is_partial or log in loaded:
-            continue
-        for k, joint in enumerate(fit.model.row_names):
-            measured = e.metrics["estimate"].per_joint.get(joint)
-            if joint not in fit.model.joints or measured is None:
-                continue
-            if not GOOD < error_of(measured) < np.inf:  # inf: a torque of 0 has no gain
-                continue
-            tau, predicted = motion.tau[mask[:, k], k], e.torques["estimate"][mask[:, k], k]
-            factor = float(predicted @ tau) / max(float(predicted @ predicted), 1e-300)
-            left = float(np.sum((tau - factor * predicted) ** 2) / np.sum((tau - predicted) ** 2))
-            if abs(factor - 1.0) < DIFFERS or left > _LEFT:
-                continue
-            friction = friction or friction_shares(fit)
-            yield finding(
-                "gain_change", log, joint, what=friction[joint] > _MOSTLY, factor=factor,
-                share_pct=100 * (1 - left), friction=friction[joint],
-            )  # fmt: skip
