@@ -9,7 +9,15 @@ from string import Formatter
 import pytest
 from helpers.paths import ROOT
 
-from robotid.base.findings import Finding, by_severity, grouped, listed, sentence, toml_key
+from robotid.base.findings import (
+    Finding,
+    by_severity,
+    grouped,
+    listed,
+    sentence,
+    tally,
+    toml_key,
+)
 from robotid.base.text import columns, command_lines, in_digits_of, period, tinted, wrapped
 from robotid.diagnosis.catalogue import entries, finding, reason_of, step_of
 
@@ -182,8 +190,9 @@ def test_findings_of_one_code_are_one_cause_and_say_what_they_share_once():
         Finding("bent", "warning", "arm_1", "arm_1: bent in 2 places"),
         Finding("bent", "warning", "arm_1", "arm_1: bent throughout"),
         Finding("old", "note", "urdf", "the URDF is of 2020"),
+        still("c.csv", "arm_1", 1e-4, "note"),
     ]
-    rest, bent, old = grouped(findings, ["arm_1", "arm_7", "arm_70"])
+    rest, bent, old, small = grouped(findings, ["arm_1", "arm_7", "arm_70"])
     assert (rest.code, rest.severity) == ("static_joint", "error")
     assert rest.joints == ("arm_1", "arm_7")  # in the order of the robot
     assert rest.findings == (findings[2], findings[0], findings[1])
@@ -192,6 +201,8 @@ def test_findings_of_one_code_are_one_cause_and_say_what_they_share_once():
     assert bent.messages == ("arm_1: bent in 2 places", "arm_1: bent throughout")
     assert (bent.severity, bent.joints) == ("warning", ("arm_1",))
     assert (old.severity, old.joints, old.messages) == ("note", (), ("the URDF is of 2020",))
+    assert (small.code, small.severity) == ("static_joint", "note"), "a cause of its own"
+    assert tally((rest, bent, old, small)) == "1 error, 2 warnings, 2 notes"
     assert grouped([]) == ()
 
 

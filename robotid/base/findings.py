@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from string import Formatter
 from typing import Any
 
-_SPREAD = 0.1  # of the numbers of a setting that is stated once for several findings
+_SPREAD = 0.1  # of the numbers of a setting that is given once for several findings
 _RANK = {"error": 0, "warning": 1, "note": 2}
 _FACTORS = {" %": 100.0, " ms": 1e3}  # of the units that a slot may have
 #: Words that name subjects: sentences that differ only in them are one.
@@ -86,12 +86,12 @@ def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def grouped(findings: Iterable[Finding], joints: Sequence[str] = ()) -> tuple[Cause, ...]:
-    """Return findings by cause, by descending severity."""
-    by_code: dict[str, list[Finding]] = {}
+    """Return findings by cause, by descending severity; notes apart from what is no note."""
+    by_code: dict[tuple[str, bool], list[Finding]] = {}
     for finding in by_severity(findings):
-        by_code.setdefault(finding.code, []).append(finding)
+        by_code.setdefault((finding.code, finding.severity == "note"), []).append(finding)
     causes = []
-    for code, alike in by_code.items():
+    for (code, _), alike in by_code.items():
         about = {joint for finding in alike for joint in finding.joints or (finding.where,)}
         named = tuple(joint for joint in joints if joint in about)
         messages = tuple(dict.fromkeys(map(sentence, _alike(alike))))
@@ -99,15 +99,12 @@ def grouped(findings: Iterable[Finding], joints: Sequence[str] = ()) -> tuple[Ca
     return tuple(causes)
 
 
-def tally(causes: Sequence[Cause], notes: Sequence[Cause], worst: str = "", how: str = "") -> str:
-    """Return the number of errors, warnings and notes, and the worst joint.
-
-    Findings with one common message count once.
-    """
-    counts = Counter(cause.severity for cause in (*causes, *notes) for _ in cause.messages)
+def tally(causes: Sequence[Cause], worst: str = "", how: str = "") -> str:
+    """Return the number of messages by severity, how to see the notes, and the worst joint."""
+    counts = Counter(cause.severity for cause in causes for _ in cause.messages)
     words = ", ".join(f"{n} {kind}{'s' * (n != 1)}" for kind, n in counts.items())
-    words += how if notes else ""
-    return f"{words}; worst: {worst}" if worst and causes else words
+    words += how if "note" in counts else ""
+    return f"{words}; worst: {worst}" if worst and set(counts) - {"note"} else words
 
 
 def sentence(findings: Sequence[Finding]) -> str:

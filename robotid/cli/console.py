@@ -58,14 +58,12 @@ def print_causes(
 ) -> None:
     from robotid.base.findings import grouped, tally
 
-    shown = [f for f in findings if is_verbose or f.severity != "note"]
-    causes = grouped(shown, joints)
-    for cause in causes:
+    causes, how = grouped(findings, joints), "" if is_verbose else " (--verbose)"
+    for cause in causes if is_verbose else [c for c in causes if c.severity != "note"]:
         for message in cause.messages:
             if message not in printed:
                 echo(f"{cause.severity}: {cause.code}: {message}", "  ", cause.severity)
-    hidden = grouped([f for f in findings if f not in shown], joints)
-    if summary := tally(causes, hidden, worst, " (--verbose)") or none:
+    if summary := tally(causes, worst, how) or none:
         echo(summary)
 
 

@@ -215,7 +215,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _boxes(words: Sequence[str], flag: str) -> tuple[Box, ...]:
-    """Return boxes that are stated as NAME=x0,y0,z0,x1,y1,z1, two corners [m]."""
+    """Return boxes that are given as NAME=x0,y0,z0,x1,y1,z1, two corners [m]."""
     boxes = []
     for word in words:
         name, _, corners = word.partition("=")

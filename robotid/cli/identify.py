@@ -446,7 +446,7 @@ def _drive_lines(result: Mapping[str, Any], *, is_verbose: bool) -> list[str]:
     varied = variation_lines(result.get("variation"))
     if "simulation" not in result:
         left_out = left_out_lines(result.get("left_out", ()))
-        return [*friction_lines(result["friction"]), *left_out, *varied]
+        return [*friction_lines(result["friction"], has_errors=is_verbose), *left_out, *varied]
     fitted = [entry for entry in result["drive_parameters"] if entry["std_error"] is not None]
     if is_verbose:
         rows = []

@@ -77,7 +77,7 @@ def survey_logs(
 
 
 def units_of_logs(entries: Sequence[LogEntry]) -> list[str]:
-    """Return the unit (name of the robot) of each log; "" if none is stated."""
+    """Return the unit (name of the robot) of each log; "" if none is given."""
     unnamed = [entry for entry in entries if not entry.unit]
     if 0 < len(unnamed) < len(entries):
         named = next(entry for entry in entries if entry.unit)

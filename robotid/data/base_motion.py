@@ -215,7 +215,7 @@ def base_of(
     if pose is None:
         return None, ""
     twist, acceleration = values.get("base twist"), values.get("base acceleration")
-    link = "" if "base imu quaternion" in values else wanted.link  # its place is stated by imu
+    link = "" if "base imu quaternion" in values else wanted.link  # its place is given by imu
     base = BaseMotion(pose, twist, acceleration, link=link)
     if frame is not None:
         imu, note = motion_of_imu(t, q, _checked(values["base imu"], "IMU", 6), frame)

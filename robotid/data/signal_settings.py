@@ -113,7 +113,7 @@ class SignalSettings(Settings):
 
 @dataclass(frozen=True)
 class LogUnits(Settings):
-    """Units of a log file; SI if not stated, and an error if the numbers look like another unit."""
+    """Units of a log file; SI by default, and an error if the numbers look like another unit."""
 
     _table: ClassVar[str] = "units"
 

@@ -40,7 +40,7 @@ ResultT = TypeVar("ResultT")
 def check_units(
     log: Log, units: LogUnits, prismatic: Collection[str] = (), turning: Collection[str] = ()
 ) -> None:
-    """Reject a log whose numbers look like another unit than SI, unless the unit is stated."""
+    """Reject a log whose numbers look like another unit than SI, unless the unit is given."""
     is_revolute = np.array([name not in prismatic for name in log.joints])
     factor = _velocity_factor(log)  # (n,), NaN for a joint that does not determine it
     if units.time is None:
@@ -88,7 +88,7 @@ def _check_clock(log: Log, factor: Array) -> None:
 def check_reach(
     log: Log, units: LogUnits, prismatic: Collection[str] = (), turning: Collection[str] = ()
 ) -> None:
-    """Reject revolute joints with angles too large for radians, unless the unit is stated."""
+    """Reject revolute joints with angles too large for radians, unless the unit is given."""
     if units.angle is not None:
         return
     is_revolute = np.array([name not in prismatic for name in log.joints])

@@ -469,7 +469,7 @@ def _errors(
     information: _Information, known: Known, choice: EstimatorSettings, typical: tuple[float, float]
 ) -> tuple[Estimate, Estimate]:
     """Return the expected estimate and that of WLS, both at the prior, without active bounds."""
-    # the weight of the prior, unless it is stated, and the plausible weight are the typical ones
+    # the weight of the prior, unless it is given, and the plausible weight are the typical ones
     factors, K = information.factors, known.mapping.K
     plain, alike = (
         _least_squares(information, known, sigma)

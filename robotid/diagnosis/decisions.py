@@ -13,6 +13,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from scipy.special import stdtr
 
+from robotid.base.tolerances import REMAINDER
 from robotid.base.typing import Array
 
 
@@ -34,8 +35,9 @@ FAMILY = Rule(most=4, share=0.05, p_value=FAMILY_P_VALUE)
 # Families selected from simulated positions, one of each at most, by the share of a joint's squared
 # residual in held-out windows with unit noise: benchmarks/bench_commands.py
 SIMULATED_FAMILY = Rule(most=3, share=0.02, p_value=None, alike=0.0)
-#: Share of the torque: a smaller gain may be an effect of the filter on velocity signs.
-FAMILY_LEAST = 0.006
+#: Size over the torque above which a term is selected or reported: a smaller one may be an effect
+#: of the filter on velocity signs.
+LEAST_TERM = 0.006
 #: p-value below which a family that is not selected is undecided: it widens intervals.
 UNDECIDED_P_VALUE = 0.25
 TENFOLD = 10.0  # Factor on the standard error of another parameter above which terms are reported
@@ -43,12 +45,12 @@ TENFOLD = 10.0  # Factor on the standard error of another parameter above which 
 AT_BOUND = 0.02
 #: Share of the squared residual that a missing term, a recording or URDF that differs, or a
 #: quantity must explain, and the largest p-value of that share.
-LEAST_SHARE, P_VALUE = 0.1, 3e-4
+LEAST_SHARE = 0.1
+P_VALUE = 3e-4
 # Terms that a drive model lacks: benchmarks/bench_misfit.py
 MISFIT = Rule(most=3, share=LEAST_SHARE, p_value=P_VALUE)
 MISFIT_WARNS = 0.25  # Share of the squared residual above which a term is a warning
-#: Size over the torque above which a term is reported, and above which it is a warning.
-MISFIT_REPORTED, MISFIT_MATTERS = 0.005, 0.02
+MISFIT_MATTERS = 0.02  # Size over the torque above which a term is a warning
 #: Share above which a coupling is reported although the other joint does not confirm it.
 ONE_SIDED = 0.6
 CONFIRMED = 0.25  # Part of the share that validation logs must confirm, if there are any
@@ -61,19 +63,27 @@ GROWN = 1.3
 ALTERATION = Rule(most=3, share=-float("inf"), p_value=None)
 #: A smaller share is also reported if validation logs confirm it fully, its p-value is tiny and its
 #: size is twice the one that changes a result: it biases masses even if noise hides it.
-WEAK, WEAK_P_VALUE, WEAK_SIZE = 0.03, 1e-5, 2.0
+WEAK = 0.03
+WEAK_P_VALUE = 1e-5
+WEAK_SIZE = 2.0
 SIGNIFICANT = 5.0  # Standard errors that its size must differ from 0
-# Segments that are held out in turn, and their samples.
-SEGMENTS, SHORTEST = 16, 10  # most segments, and fewest independent samples of one
+SEGMENTS = 16  # Largest number of segments that are held out in turn
+SHORTEST = 10  # Smallest number of independent samples of one
 FEWEST = 6  # Smallest number of segments for a test
 OUTLIER = 12.0  # Typical residuals above which a sample is excluded
 BEYOND_NOISE = 3.0  # Standard errors, or deviations, beyond which a value is no noise
 SHARE_OF_ROWS = 0.02  # Share of the rows from which a fault of single rows is reported
 ROWS = 2000  # Instants of a motion that are used: more are not independent after the filter
-STEP = 1e-3  # Relative step of a derivative by a shape
+STEP = 1e-3  # Step of a derivative by a size, relative to a shape
+STEPS = 5  # Largest number of Gauss-Newton steps of sizes
+SETTLED = 0.2  # Step over its standard error below which sizes have converged
 #: Size of the correlation from which two parameters or signals are strongly correlated: if one were
 #: known, the error of the other would be less than a third of what it is, sqrt(1 - r^2) = 0.31.
 CORRELATED = 0.95
+#: Share of rows, of power, or of a torque from which it is most of it.
+MOST = 0.8
+#: Share of its largest or usual value below which a quantity is about 0.
+ZERO = 0.05
 #: Relative difference up to which two values agree: as a mass or a gravity torque confirms the
 #: torque scale; and from which one is reported, or a standard error is too large to use a value.
 AGREES = 0.05
@@ -85,7 +95,6 @@ NO_ERROR_OF_MASSES = 3.0
 BETTER = 0.5
 SCATTERED = 3  # Segments from which a scatter is determined
 NOTHING = 1e-300  # A sum of squares that is 0, as a divisor
-_STILL = 1e-9  # of the largest squared residual of a segment: below, the joint is at rest in it
 Option = TypeVar("Option", bound=Hashable)
 
 
@@ -158,7 +167,7 @@ def p_value(before: Array, after: Array, fitted: int) -> float:
 
 def _student(before: Array, after: Array) -> float:
     """Return the p-value of the mean share; 1 for too few segments."""
-    moves = before > _STILL * before.max(initial=0.0)
+    moves = before > REMAINDER * before.max(initial=0.0)
     if moves.sum() < SCATTERED:
         return 1.0
     gain = (before - after)[moves] / np.maximum(before, after)[moves]

@@ -167,18 +167,17 @@ def tree_lanes() -> ModuleType:
 
 
 def choose_engine(model: RobotModel, samples: int, compiled: bool | None) -> str:
-    """Return the name of the code that computes the rows, and log it."""
-    enough = -(-LONG_ENOUGH // work_per_sample(model))
-    engine = "Pinocchio"
-    if compiled is None and samples < enough:
-        engine += f" (the compiled path is slower below {enough} samples)"
-    elif compiled is not False:
-        reason = why_not(model)
-        if reason is None and not compiled and not tree_lanes().inertial_rows.stats.cache_path:
-            reason = "no folder for compiled code; set one as NUMBA_CACHE_DIR"
-        engine = COMPILED if reason is None else f"{engine} ({reason})"
-    _log.info("%s: regressor of %d samples: %s", model.name, samples, engine)
-    return engine
+    """Return the name of the code that computes the rows, and log why it is not the faster one."""
+    is_short = compiled is None and samples < LONG_ENOUGH / work_per_sample(model)
+    if compiled is False or is_short:
+        return "Pinocchio"
+    reason = why_not(model)
+    if reason is None and not compiled and not tree_lanes().inertial_rows.stats.cache_path:
+        reason = "no folder for compiled code; set one as NUMBA_CACHE_DIR"
+    if reason is None:
+        return COMPILED
+    _log.info("%s: regressor of %d samples: Pinocchio (%s)", model.name, samples, reason)
+    return f"Pinocchio ({reason})"
 
 
 def drive_values(

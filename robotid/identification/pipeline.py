@@ -13,7 +13,7 @@ from robotid.base.exceptions import (
     RankDeficientError,
     SettingsError,
 )
-from robotid.base.findings import Finding, not_ignored
+from robotid.base.findings import Finding, grouped, not_ignored
 from robotid.base.typing import ProgressCallback, ignore_progress, report_stage
 from robotid.data.files.columns import Needs
 from robotid.data.files.read import Readable, read_logs
@@ -150,7 +150,7 @@ def conclude(
     return replace(
         result,
         findings=tuple(findings),
-        log_errors=tuple(finding.message for finding in log_errors),
+        log_errors=tuple(m for cause in grouped(log_errors) for m in cause.messages),
         warnings=warnings_of(counted, model.joints, names, is_robust=is_robust),
     )
 

@@ -10,7 +10,7 @@ from robotid.diagnosis.verdict.verdict import uses_line
 #: Column heads of the errors of other predictions, by name: of torques, then of positions.
 _BESIDE = {
     "urdf_with_drives": "URDF +\ndrives %",
-    "wls": "WLS\n%",
+    "wls": "least\nsquares %",
     "second_order": "2nd\norder %",
     "rows": "torques\nalone %",
     "urdf": "URDF\n%",
@@ -47,16 +47,16 @@ def _mark(metrics: Mapping[str, Any]) -> str:
     return "" if metrics["better_than_constant"] else " *"
 
 
-def friction_lines(friction: Mapping[str, Any]) -> list[str]:
+def friction_lines(friction: Mapping[str, Any], *, has_errors: bool = True) -> list[str]:
     """Return the friction of joints besides viscous and Coulomb, and its effect, as text."""
     words = []
     for joint, choice in friction.items():
         if choice["families"]:
             selected = [step for step in choice["tried"] if step["is_selected"]]
             ends = (step["held_out_error_pct"] for step in (choice["tried"][0], selected[-1]))
-            gain = "{:.1f} -> {:.1f} %".format(*ends)
-            words.append(f"{joint} {' + '.join(choice['families'])} ({gain})")
-    title = "further friction (held-out error)"
+            gain = " ({:.1f} -> {:.1f} %)".format(*ends) if has_errors else ""
+            words.append(f"{joint} {' + '.join(choice['families'])}{gain}")
+    title = f"further friction{' (held-out error)' * has_errors}"
     return [f"{title}: {', '.join(words)}"] if words else []
 
 

@@ -1,6 +1,7 @@
 """Run the paper's simulation and write its results, and a page of its figures and tables."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -451,10 +452,10 @@ def _estimate_figures(studies: Sequence[ModelStudy]) -> str:
     charts = []
     for study in studies:
         names, P_hat = study.dynamics.names, study.history.estimates[:, 0]
-        lines = _lines(dict(zip(names, P_hat.T, strict=True)))
-        labels = [f"{name}, true" for name in names]
-        true = np.tile(study.P[:, None], len(P_hat))
-        lines += _lines(dict(zip(labels, true, strict=True)), is_weak=True)
+        lines = [Series(name, P_hat[:, k], f"tone-{name[1:]}") for k, name in enumerate(names)]
+        for line, P in zip(tuple(lines), study.P, strict=True):
+            true = np.full(len(P_hat), P)
+            lines.append(replace(line, label=f"{line.label}, true", y=true, is_weak=True))
         title = f"Figure 5. {study.name}: estimates (24)"
         charts.append(_over_iterations(title, "estimate [kg m²]", lines))
     return _plots(*charts)

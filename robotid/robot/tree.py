@@ -67,10 +67,10 @@ class Joint:
     type: str  # fixed, revolute, continuous or prismatic
     parent: str  # parent link
     child: str  # child link
-    lower: float = -math.inf  # lower position limit [rad or m], -inf if none is stated
-    upper: float = math.inf  # upper position limit [rad or m], inf if none is stated
-    velocity: float = math.inf  # velocity limit [rad/s or m/s], inf if none is stated
-    effort: float = math.inf  # effort limit [N m or N], inf if none is stated
+    lower: float = -math.inf  # lower position limit [rad or m], -inf if none is given
+    upper: float = math.inf  # upper position limit [rad or m], inf if none is given
+    velocity: float = math.inf  # velocity limit [rad/s or m/s], inf if none is given
+    effort: float = math.inf  # effort limit [N m or N], inf if none is given
     # name of the joint that it mimics, multiplier [-], offset [rad or m]; or None
     mimic: tuple[str, float, float] | None = None
     xyz: tuple[float, ...] = (0.0, 0.0, 0.0)  # origin in the parent's frame [m]

@@ -216,9 +216,9 @@ def test_rows_are_projected_and_counted(quadruped, rng):
     both = merge([factors, factors.select(np.arange(len(factors.names)))])
     assert both.is_projected
     assert factors.select(np.arange(3)).is_projected
-    level = both.noise_levels(np.zeros(len(both.names)), np.full(18, 2.0))
+    level = both.noise_levels(np.zeros(len(both.names)), np.arange(18.0))
     tau = (dense[..., -1] ** 2).sum()
-    np.testing.assert_allclose(level, np.sqrt(2 * tau / 36.0))
+    np.testing.assert_allclose(level, np.sqrt(2 * tau / 153.0))  # 0 + 1 + ... + 17
 
 
 def test_dependent_forces_are_counted_once(rng):

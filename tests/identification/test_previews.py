@@ -61,7 +61,8 @@ def recorded(ur5, motion):
 
 @pytest.fixture(scope="module")
 def found(ur5, recorded):
-    return identify(ur5, [recorded], friction="none", estimator="wls")
+    settings = SignalSettings(cutoff=15.0)
+    return identify(ur5, [recorded], friction="none", estimator="wls", signals=settings)
 
 
 @pytest.mark.parametrize("colour", [0.0, 0.9])
@@ -151,6 +152,9 @@ def test_bands_of_torques_are_root_mean_squares_over_all_motions(ur5):
 def test_a_run_before_adds_what_it_said_and_its_noise(ur5, motion, found):
     log = motion[0]
     ahead = preview(ur5, [log], given=found, estimator="wls")
+    rows, before = (x.fitted[0].recording for x in (ahead.expected, found))
+    np.testing.assert_array_equal(rows.mask, before.mask)  # the settings of the run
+    np.testing.assert_allclose(rows.trajectory.a, before.trajectory.a, rtol=1e-9)
     assert set(ahead.noise.origins) == {"found"}
     density = np.sqrt(ahead.noise.density(0.0) * RATE)
     np.testing.assert_allclose(density, STD, rtol=0.35)  # 48 segments
@@ -159,7 +163,8 @@ def test_a_run_before_adds_what_it_said_and_its_noise(ur5, motion, found):
     assert np.median(ahead.gain) == pytest.approx(np.sqrt(2.0), abs=0.1)
     other = moved(ur5, np.random.default_rng(5))[0]
     assert (preview(ur5, [other], given=found, estimator="wls").gain >= 1.0).all()
-    alone = preview(ur5, [log], noise=ahead.noise, estimator="wls").base_error
+    same = {"noise": ahead.noise, "estimator": "wls", "signals": found.stated.signals}
+    alone = preview(ur5, [log], **same).base_error
     together = 1.0 / np.sqrt(ahead.before**-2 + alone**-2)
     np.testing.assert_allclose(ahead.base_error, together, rtol=0.25)
 

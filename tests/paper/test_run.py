@@ -212,6 +212,7 @@ def test_figure_5_is_each_parameter_beside_its_true_value(studies):
         count = len(study.dynamics.names)
         for i, name in enumerate(study.dynamics.names):
             assert [series[i]["label"], series[count + i]["label"]] == [name, f"{name}, true"]
+            assert series[i]["tone"] == series[count + i]["tone"] == f"tone-{name[1:]}"
             close(series[i]["y"], study.history.estimates[:, 0, i])
             close(series[count + i]["y"], np.full(4, study.P[i]))
 

@@ -232,7 +232,7 @@ NOUNS = {
 TORQUES = ("tau", "tauref")
 _SIZES = ("loadsize_", "load_size_")  # absolute values of loads, as bus servos report them
 _OF_JOINTS = (*NOUNS, "current")  # kinds that are not of motors
-_SHOWN = 12  # names in a list
+_SHOWN = 6  # names in a list
 _SIMULATION = (  # from commands, on the command line and in a job file
     "by --estimator simulation --kp N_M_PER_RAD or in the job file; without kp, the masses of the "
     """URDF determine the scale
@@ -488,7 +488,6 @@ class Finder:
         has = f"joint {joint!r} has the current {current!r}"
         if len(without) > 1:
             has = f"joints {listed(without)} have currents"
-        gains = ", ".join(f"{toml_key(name)} = ..." for name in without)
         flags = " ".join(f"--gain {name}=..." for name in without)
         locks = " ".join(f"--lock {name}=0" for name in absent)
         also = (
@@ -497,9 +496,8 @@ class Finder:
         )
         return DataError(
             f"{self.where}: {has} but no gain; set it in N m/A: {flags}, or in the job file "
-            f"[torque] gains = {{ {gains} }}{also if absent else ''}. A payload of known mass "
-            "determines unknown gains: robotid payload URDF LOADED --reference BARE --mass KG "
-            "--gains",
+            f"[torque] gains{also if absent else ''}. A payload of known mass determines unknown "
+            "gains: robotid payload URDF LOADED --reference BARE --mass KG --gains",
             code="missing_gain",
         )
 
@@ -570,9 +568,10 @@ class Finder:
         read = [x for key, x in recognised.items() if key.startswith(references)]
         commanded = [x for x in names if is_commanded(x) and x in {*left, *read}]
         others = [name for name in left if name not in commanded]
+        named = f"column{'s' * (len(sought) > 1)} {listed(map(repr, sought), _SHOWN)}"
         text = (
-            f"{self.where} has no column{'s' * (len(sought) > 1)} {listed(map(repr, sought), 6)}; "
-            f"{' and '.join(nouns)} columns found: {listed(of_kind, _SHOWN)}."
+            f"{self.where} has no {named}; {' and '.join(nouns)} columns found: "
+            f"{listed(of_kind, _SHOWN)}."
         )
         for label, some in (
             ("Commanded, not measured", [name for name in commanded if name not in of_kind]),
@@ -641,8 +640,12 @@ class Finder:
                 f"If {listed(moving)}, which moves in the log, has no drive, set passive = "
                 f"[{', '.join(map(quoted, moving))}] in the job file; else record its torque"
             )
+        names, one = listed(at_rest), len(at_rest) == 1
         locks = " ".join(f"--lock {joint}=0" for joint in at_rest)
         locked = ", ".join(f"{toml_key(joint)} = 0" for joint in at_rest)
-        one = len(at_rest) == 1
+        if len(at_rest) > _SHOWN:
+            names, locked = f"the other {len(at_rest)} joints", '"*" = 0'
+            logged = ",".join(joint for joint in self.joints if joint not in joints)
+            locks = f'--joints {logged} --lock "*=0"'
         how = "was at rest, lock it at its position" if one else "were at rest, lock them there"
-        return f"If {listed(at_rest)} {how}, as {locks}, or locked = {{ {locked} }} in the job file"
+        return f"If {names} {how}, as {locks}, or locked = {{ {locked} }} in the job file"

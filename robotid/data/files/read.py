@@ -103,7 +103,7 @@ def read_log(
         source: The topic of a bag or group of a file, names of joints in it, quantity of effort.
         transmissions: The motors and gears, if the file has columns of motors.
         needs: Quantities that are required besides positions, as of ``lay_out``.
-        base: Columns of a floating base and of contacts; none if not stated.
+        base: Columns of a floating base and of contacts; none if not given.
         passive: Joints without a drive, which need no torque; without a position, they are not
             joints of the log.
         robot: All movable joints of the robot, in the order of the URDF: that of numbered columns.
@@ -402,7 +402,7 @@ def _moves(
 def _notes_of_sensors(
     where: str, table: Table, columns: Mapping[str, Sequence[str]], base: BaseColumns
 ) -> list[str]:
-    """Return a note on the columns of other topics; reject wrenches whose axes are not stated."""
+    """Return a note on the columns of other topics; reject wrenches whose axes are not given."""
     forces = [name for name in columns.get("wrench", ()) if name in table.sensors]
     links = {name.partition(" ")[2] for name in base.wrenches} - {*base.local}
     if forces and links and table.axes.get("wrench") == "link":

@@ -20,6 +20,7 @@ from robotid.diagnosis.decisions import (
     CORRELATED,
     DIFFERS,
     FEWEST,
+    MOST,
     NO_ERROR_OF_MASSES,
     OUTLIER,
     ROWS,
@@ -27,29 +28,23 @@ from robotid.diagnosis.decisions import (
     SEGMENTS,
     SHARE_OF_ROWS,
     SIGNIFICANT,
+    ZERO,
 )
 from robotid.robot.parameters import ParameterLayout
 from robotid.robot.tree import Joint
 
 MOVING = 0.1  # Share of the log in which a joint must move
-ZERO = 0.05  # Share of its largest value, below which a torque that is never negative is 0
 _LEAST = {"q": STATIC, "dq": AT_REST}  # [rad or m, rad/s or m/s] smaller values: at rest
-_BEYOND = 1.5  # deviation of a spike over the amplitude
 _BITS = range(9, 24)  # of encoders
 _OTHER = 0.01  # relative difference from which a clock, or the step of an encoder, is another one
 _RPM = 30 / np.pi  # [1/min per rad/s]
 _LONG = 0.05  # [s] a longer gap is a warning
-_BUNCHED = 0.2  # [mean steps] a shorter step is of rows that were stamped together
 # [s] A longer rest at an end is reported; in a longer gap, a position that moves as in one step
 # shows that the clock was set.
 _PAUSE = 1.0
-_CONTINUES = 0.15  # motion after repeated rows, over that in as many rows before and after ...
-_AROUND = 10  # ... at most so many rows of each
 _LENGTHS = {"mm": 1e-3, "cm": 1e-2}  # [m]
 _HARDLY = {"rad": 0.2, "m": 0.05}  # smaller range: the joint hardly moves
-_SMOOTHED = 9  # rows of the mean torque that is compared with its largest value ...
-_FLAT = 0.8  # ... and share of rows there, and of rows in its direction, from which it is clipped
-_REGULAR = 0.8  # share of holds of about one length that a quantised torque does not reach
+_AROUND = 9  # rows around one, of the mean torque and of a motion before and after repeated rows
 
 
 def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
@@ -114,7 +109,7 @@ def _spikes(
     for j, (joint, x) in enumerate(zip(log.joints, values.T, strict=True)):
         amplitude, deviation = max(amplitudes[j], least), x - smooth[:, j]
         typical = max(1.48 * float(np.median(np.abs(deviation))), noise[j])
-        smallest = max(_BEYOND * amplitude, OUTLIER * typical)
+        smallest = max(amplitude / BETTER, OUTLIER * typical)
         rows = np.flatnonzero(np.abs(deviation) > smallest)
         if len(rows) == 0:
             continue
@@ -369,7 +364,7 @@ def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
 def _bunches(log: Log, step: Array) -> Iterator[Finding]:
     """Yield rows whose stamps are those of their arrival: they come together after a pause."""
     mean = float(np.mean(step[step < _PAUSE])) if (step < _PAUSE).any() else 0.0
-    is_bunched = step < _BUNCHED * mean
+    is_bunched = step < DIFFERS * mean
     share = float(np.mean(is_bunched))
     moved = np.abs(np.diff(log.q, axis=0)).mean(axis=0)
     change = np.abs(np.diff(log.q[:, int(np.argmax(moved))]))  # of the joint that moves most
@@ -378,7 +373,7 @@ def _bunches(log: Log, step: Array) -> Iterator[Finding]:
     usual = float(np.median(step[~is_bunched]))
     yield finding(
         "bunched_stamps", log.name, rows=float(is_bunched.sum()), share=share, of=len(log.t),
-        longest=float(step.max()), within=_BUNCHED * mean, mean=mean, usual=usual,
+        longest=float(step.max()), within=DIFFERS * mean, mean=mean, usual=usual,
         cure=abs(mean / usual - 1.0) < AGREES,
     )  # fmt: skip
 
@@ -420,7 +415,7 @@ def _in_motion(log: Log, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
     if not log.has_torque:
         steps = np.array([units.quantum(x) for x in q.T])
         moves &= (np.abs(change) > 1.5 * steps).any(axis=1)
-    continues = np.linalg.norm(change, axis=1) >= _CONTINUES * around * n / m
+    continues = np.linalg.norm(change, axis=1) >= DIFFERS * around * n / m
     rows = np.flatnonzero(moves & continues)
     return list(zip(first[rows].tolist(), last[rows].tolist(), strict=True))
 
@@ -445,11 +440,11 @@ def _clipping(log: Log) -> Iterator[Finding]:
     from scipy.ndimage import uniform_filter1d  # takes long to import
 
     moving = np.append((np.diff(log.q, axis=0) != 0).any(axis=1), False)
-    ahead = np.minimum(np.arange(len(log.t)) + _SMOOTHED, len(log.t) - 1)
+    ahead = np.minimum(np.arange(len(log.t)) + _AROUND, len(log.t) - 1)
     travel, least = log.q[ahead] - log.q, AT_REST * (log.t[ahead] - log.t)[:, None]  # (N, n)
     own = np.abs(travel) > least
-    noise, fewest = _white_noise(log.t, log.tau), max(_SMOOTHED, SHARE_OF_ROWS * len(log.t))
-    smooth = uniform_filter1d(log.tau, _SMOOTHED, axis=0, mode="nearest")
+    noise, fewest = _white_noise(log.t, log.tau), max(_AROUND, SHARE_OF_ROWS * len(log.t))
+    smooth = uniform_filter1d(log.tau, _AROUND, axis=0, mode="nearest")
     for j, (joint, x) in enumerate(zip(log.joints, log.tau.T, strict=True)):
         if moving.any() and np.ptp(x) == 0:
             is_undriven = np.ptp(log.q[:, j]) > STILL and not x.any()
@@ -459,7 +454,7 @@ def _clipping(log: Log) -> Iterator[Finding]:
                 "constant_torque", log.name, joint, value=value, quoted=quoted(joint), **words
             )
             continue
-        band = (BEYOND_NOISE + 1) * noise[j] / np.sqrt(_SMOOTHED)  # from 3 errors above to 1 below
+        band = (BEYOND_NOISE + 1) * noise[j] / np.sqrt(_AROUND)  # from 3 errors above to 1 below
         if not own[:, j].any():
             continue
         for sign in (1.0, -1.0):
@@ -470,7 +465,7 @@ def _clipping(log: Log) -> Iterator[Finding]:
                 runs = [(i, k) for i, k in runs_of(depth <= 4 * band) if at[i:k].any()]
                 near = sum(int(own[i:k, j].sum()) for i, k in runs)
                 along = np.sum(sign * travel[:, j] > least[:, 0])
-                is_flat = _FLAT * near < at.sum() < _FLAT * along  # else a maximum, or friction
+                is_flat = MOST * near < at.sum() < MOST * along  # else a maximum, or friction
                 if is_flat and 4 * band < np.median(depth):
                     limit = float(np.median(x[at]))
                     rows = np.sum((np.abs(x - limit) <= BEYOND_NOISE * noise[j]) & moving)
@@ -508,5 +503,5 @@ def _hold(x: Array) -> int:
     lengths = np.diff(changes)
     typical = int(np.median(lengths))
     # if the log rate is no multiple of the update rate, two lengths occur
-    is_regular = np.mean(np.abs(lengths - typical) <= (1 if typical > 2 else 0)) > _REGULAR
+    is_regular = np.mean(np.abs(lengths - typical) <= (1 if typical > 2 else 0)) > MOST
     return typical if typical > 1 and is_regular else 1

@@ -18,7 +18,7 @@ from robotid.data.log import REPEATED, Log, Trajectory, repeated_share
 from robotid.data.signal_settings import LogUnits, SignalSettings
 from robotid.data.units import AT_REST, STILL
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import BETTER, NOTHING, SCATTERED, SEGMENTS
+from robotid.diagnosis.decisions import BETTER, NOTHING, SCATTERED, SEGMENTS, ZERO
 from robotid.diagnosis.logs import channels
 from robotid.diagnosis.logs.base_checks import check_base
 from robotid.diagnosis.logs.command_channels import check_commands
@@ -167,10 +167,10 @@ def _drives_off(probe: Probe, coarse: Collection[str], name: str) -> Iterator[Fi
         for x in (probe.tau, loads, probe.v)
     )
     moves = speed > AT_REST**2
-    is_small = moves & (tau < channels.ZERO * load)
+    is_small = moves & (tau < ZERO * load)
     for j, joint in enumerate(probe.model.joints):
         is_all = bool((is_small == moves)[:, j].all())
-        is_off = is_small[:, j] & (is_all | (tau[:, j] < channels.ZERO**2 * tau[:, j].mean()))
+        is_off = is_small[:, j] & (is_all | (tau[:, j] < ZERO**2 * tau[:, j].mean()))
         off = np.flatnonzero(is_off)
         if len(off) < SCATTERED or (joint in coarse and not is_all):
             continue

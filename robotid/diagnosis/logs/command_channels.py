@@ -17,6 +17,7 @@ from robotid.diagnosis.decisions import (
     BETTER,
     CORRELATED,
     DIFFERS,
+    MOST,
     SCATTERED,
     SHARE_OF_ROWS,
     SIGNIFICANT,
@@ -26,15 +27,11 @@ from robotid.diagnosis.logs.channels import runs_of
 from robotid.estimation.fitting.standard_errors import QUANTILE
 
 SECONDS = 5.0  # [s] of the averaged spectra, and least total time of constant commands
-_COHERENT = 0.8  # least coherence of a frequency that is used
 EXCITED = 1e-4  # least power of a command, over that of its strongest frequency
 _LONGEST = 0.5  # [s] longest delay, or lead, of a position; a joint has settled after it
 _INTERVAL = 0.05  # [s] over which signals are averaged to compare their changes
-_HALF = 0.5  # share of the power at the bandwidth, and of slow sweeps that a joint should follow
 _SLOW = 5.0  # [lags] least duration of slow sweeps
 _RESOLVED = 10.0  # least number of encoder steps in a sweep, and of rows per period
-# Share of the rows above half of a speed that are near it, in movements at one speed; a sine: 0.43
-_FLAT = 0.6
 
 
 def check_commands(log: Log, prismatic: Collection[str] = ()) -> Iterator[Finding]:
@@ -115,7 +112,7 @@ class _Loop:
         f, both = csd(self.command, self.q, **how)
         command, q = welch(self.command, **how)[1], welch(self.q, **how)[1]
         share = np.abs(both) ** 2 / np.where(command * q > 0, command * q, np.inf)
-        used = (share > _COHERENT) & (command > EXCITED * command.max()) & (f > 0)
+        used = (share > MOST) & (command > EXCITED * command.max()) & (f > 0)
         segments = 2 * len(self.q) / n - 1
         share = np.minimum(share[used], 1 - AGREES**2)  # joints are not linear
         return f[used], both[used] / command[used], 2 * segments * share / (1 - share)
@@ -130,7 +127,7 @@ class _Loop:
             return np.nan
         power = median_filter(np.abs(H), size=2 * SCATTERED - 1, mode="nearest") ** 2
         slow = int(np.argmax(power[:SCATTERED]))  # the first one may be due to drift
-        weak = np.flatnonzero(power[slow:] < _HALF * power[slow])
+        weak = np.flatnonzero(power[slow:] < power[slow] / 2)
         return float(f[slow + weak[0]]) if len(weak) else np.nan
 
     @cached_property
@@ -288,7 +285,7 @@ def _stopped(log: Log, loop: _Loop) -> Iterator[Finding]:
         at, near = float(np.median(q[beyond])), DIFFERS * float(sent[beyond].std())
         flat = np.mean(np.abs(q[beyond] - at) < near)
         is_far = quantum(loop.q) < near < DIFFERS * np.ptp(q) and sent.max() - at > STILL
-        if flat > 1 - BETTER**2 and is_far and np.mean(q > at + near) < AGREES:
+        if flat > MOST and is_far and np.mean(q > at + near) < AGREES:
             most = sign * float(np.max(sign * loop.command))
             figures = {"at": sign * at, "command": most, "share": share, "movements": visits}
             yield finding("end_stop", log.name, loop.name, side=side, unit=loop.unit, **figures)
@@ -302,7 +299,7 @@ def _interrupted(log: Log, loop: _Loop) -> Iterator[Finding]:
     dead = np.median(swept - followed) if len(swept) >= SCATTERED else np.ptp(signals[1]) / 4
     windows = np.lib.stride_tricks.sliding_window_view(signals, rows, axis=1)
     moved, expected = np.ptp(windows, axis=2)
-    least = max(2 * dead, _HALF * np.median(expected), STILL)
+    least = max(2 * dead, BETTER * np.median(expected), STILL)
     is_at_rest = moved < max(STATIC, 2 * quantum(loop.q))
     for i, k in runs_of(np.convolve(is_at_rest, np.ones(rows)) > 0):
         if np.ptp(signals[1, i:k]) > least:
@@ -334,7 +331,7 @@ def _small(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
         code, sweep = "small_command", float(np.ptp(loop.command))
         share = float(np.median(followed / swept)) if len(swept) >= SCATTERED else 1.0
         evidence = {"sweep": sweep, "followed": share, "step": step}
-        if share < _HALF:
+        if share < BETTER:
             what, dead = "suppressed", float(np.median(swept - followed))
             evidence |= {"sweep": float(np.median(swept)), "dead": dead, "wanted": 5 * dead}
             if loop.response_to(loop)[1] < AGREES:  # it is linear, without a dead band
@@ -360,7 +357,7 @@ def _saturated(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
         clipped = []
         for start, stop in runs_of(np.abs(v) > 0.5 * top):
             at = np.flatnonzero(np.abs(v[start:stop]) > (1 - DIFFERS) * top) + start
-            if len(at) >= 5 and len(at) >= _FLAT * (stop - start):
+            if len(at) >= 5 and len(at) >= BETTER * (stop - start):
                 unlike = abs(float(np.mean(wanted[at])) / float(np.mean(v[at])) - 1)
                 if unlike > 2 * DIFFERS:
                     clipped.append((len(at) / len(v), float(np.ptp(error[at]))))
@@ -396,5 +393,5 @@ def _disturbed(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
             continue
         fit = others @ np.linalg.lstsq(others, moved)[0]
         share = 1 - float(np.sum((moved - fit) ** 2) / np.sum(moved**2))
-        if share >= 1 - BETTER**2:
+        if share >= MOST:
             yield finding("moved_by_others", log.name, loop.name, size=size, share=share)

@@ -10,11 +10,11 @@ from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process, resolve, unwrap
 from robotid.data.units import AT_REST
+from robotid.diagnosis.decisions import ZERO
 from robotid.dynamics.rows import drive_values, friction_directions, friction_speeds, inertial_rows
 from robotid.robot.model import RobotModel
 
 _MARGIN = 0.15  # [s] rows closer to the end of a segment are not used: the filter has not settled
-_SLOW = 0.05  # largest speed of the unknown sign of friction of a slow joint, over its largest
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class Probe:
 def drive_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
     """Return the columns 1, a, v and sign v of the drives, and of coupled drives, (N, n, 4 + k)."""
     least = AT_REST * model.layout.drive_speeds[: v.shape[1]]
-    still = np.minimum(least, _SLOW * np.abs(v).max(axis=0))
+    still = np.minimum(least, ZERO * np.abs(v).max(axis=0))
     own = [np.ones_like(v), a, v, np.tanh(v / np.where(still > 0, still, least))]
     return np.concatenate([np.stack(own, axis=2), coupled_columns(model, q, v, a)], axis=2)
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.diagnosis.logs.channels import ZERO
+from robotid.diagnosis.decisions import ZERO
 from robotid.diagnosis.logs.probe import Probe, drive_columns
 from robotid.dynamics.rows import inertial_rows, joint_constants
 from robotid.robot.model import GRAVITY, RobotModel

@@ -37,12 +37,8 @@ from robotid.dynamics.torque import (
 from robotid.estimation.fitting.fitted import Fit
 from robotid.robot.model import GRAVITY, RobotModel
 
-_STEP = 1e-5  # step of a finite difference [-, rad or m]
-_STEPS = 5  # Gauss-Newton steps of a size
 _SPLINES = 40  # largest number of B-splines in time ...
 _BLOCKS = 3  # ... and blocks that are held out, of one of them
-#: Readings of one log that may contradict others.
-_OF_ONE_LOG = ("position_offset", "angle_scale", "torque_scale", "joint_delay", "gravity")
 _Altered = tuple[RobotModel, Sequence[Trajectory]]
 
 
@@ -164,11 +160,11 @@ def _bodies(model: RobotModel, pi: Array) -> Array:
 def _drive_slopes(model: RobotModel, pi: Array, at: Sequence[Trajectory], key: str) -> Array:
     """Return the derivatives of the drives' torques by q, v or a of each joint, (N, n, n)."""
     # Drives of their own joints only: all joints are moved together.
-    every, before = np.eye(len(model.joints)), _drives(model, pi, at)
+    h, every, before = decisions.STEP, np.eye(len(model.joints)), _drives(model, pi, at)
     is_plain = np.array_equal(model.layout.drive_ratios, every) and not is_loaded(model)
     moves = every.sum(axis=0, keepdims=True) if is_plain else every
-    ends = [[replace(m, **{key: getattr(m, key) + _STEP * on}) for m in at] for on in moves]
-    D = np.stack([(_drives(model, pi, end) - before) / _STEP for end in ends], axis=2)
+    ends = [[replace(m, **{key: getattr(m, key) + h * on}) for m in at] for on in moves]
+    D = np.stack([(_drives(model, pi, end) - before) / h for end in ends], axis=2)
     return D * every if is_plain else D
 
 
@@ -263,8 +259,11 @@ def _between_logs(
     """Return samples with columns for what is different in one log, and its finding."""
     own, rows = others.left_out(sample)
     possible = alterations(model, [*_of_log(model, own)])
+    before = float(Trials(own, np.empty((*own.r.shape, 0))).held_out.left([]).sum())
+    noise = own.share * np.count_nonzero(own.weight)
     for alteration, difference, _ in _accepted(model, own, possible, own.recordings[0].log.name):
-        if difference.evidence["share_pct"] < 100.0 * (1.0 - decisions.BETTER**2):
+        left = (1.0 - 0.01 * difference.evidence["share_pct"]) * before - noise
+        if left > decisions.BETTER**2 * (before - noise):
             break  # it is not clear
         columns = np.zeros((*sample.r.shape, possible[alteration].shape[2]))
         columns[rows] = possible[alteration]
@@ -275,7 +274,7 @@ def _between_logs(
 def _of_log(model: RobotModel, sample: Sample) -> Iterator[Reading]:
     """Yield the readings of one log that differs from others: of its channels, a load, a robot."""
     for reading in readings(model, sample.standard, sample):
-        if reading.code in _OF_ONE_LOG:
+        if reading.code in ("position_offset", "torque_scale", "joint_delay", "gravity"):
             together = [()] * (reading.code in ("torque_scale", "joint_delay"))
             yield replace(reading, groups=[*reading.groups, *together])
     pi, at = sample.standard, sample.at
@@ -418,15 +417,15 @@ def _refined(
     """Return the sizes of an alteration, their standard errors, and the samples corrected by it."""
     # Torques are nonlinear over 0.1 rad: Gauss-Newton steps until the sizes converge.
     every, error = list(range(len(x))), np.full(len(x), np.inf)
-    for _ in range(_STEPS):
+    for _ in range(decisions.STEPS):
         model, at = applied(x)
         tau = _torques(model, pi, at)
         sample = along(sample, model, at, tau)
-        beyond = [applied(x + _STEP * axis) for axis in np.eye(len(x))]
+        beyond = [applied(x + decisions.STEP * axis) for axis in np.eye(len(x))]
         moved = [_torques(model, pi, at) for model, at in beyond]
-        Z = (np.stack(moved, axis=-1) - tau[..., None]) / _STEP
+        Z = (np.stack(moved, axis=-1) - tau[..., None]) / decisions.STEP
         step, covariance = Trials(sample, Z).whole.estimate(every, sample.fitted)
         x, error = x + step, np.sqrt(np.diag(covariance))
-        if np.linalg.norm(step) < 0.1 * np.linalg.norm(error):
+        if np.linalg.norm(step) < decisions.SETTLED * np.linalg.norm(error):
             break
     return x, error, sample

@@ -29,8 +29,7 @@ from robotid.estimation.fitting.fitted import Solution
 from robotid.robot.drive_term import DataRange, DriveMotion, DriveTerm, Family
 from robotid.robot.drives import FAMILIES
 
-_GRID = 6  # values of a shape that are tested ...
-_SPAN = 100.0  # ... and the largest over the smallest of them
+_GRID = 6  # values of a shape that are tested
 _REVOLUTION = 2 * np.pi  # [rad]
 _LOADED = ("load", "lag")  # families that depend on the torque of the drive
 _Sized = tuple[Family, list[float]]  # a family and its shapes
@@ -76,7 +75,7 @@ def choose_drives(
 def _drives(
     fit: Solution, sample: Sample, wanted: Mapping[str, Sequence[str] | None]
 ) -> dict[int, _Drive]:
-    """Return the drives whose families are stated or selected, by the index of their joint."""
+    """Return the drives whose families are given or selected, by the index of their joint."""
     model = fit.model.with_reference(sample.standard)
     motions = [drive_motion_along(model, x.trajectory) for x in sample.recordings]
     first = sample.weight.shape[1] - len(sample.joints)
@@ -112,9 +111,7 @@ def _candidates(drive: _Drive, families: Sequence[Family]) -> Iterator[_Sized]:
         terms = family.make(drive.data_range, *[low for low, _ in bounds])
         if not drive.has_load and any(term.needs_load for term in terms):
             continue
-        grids = [np.geomspace(low, min(high, _SPAN * low), _GRID).tolist() for low, high in bounds]
-        for grid, (_, high) in zip(grids, bounds, strict=True):
-            grid += [high] * (grid[-1] < high)
+        grids = [np.geomspace(*ends, _GRID).tolist() for ends in bounds]
         yield from ((family, list(sizes)) for sizes in product(*grids))
 
 
@@ -185,7 +182,7 @@ def _auto(sample: Sample, drive: _Drive) -> DriveChoice:
 
     def offered() -> Round[int]:
         left, total = every.left_each(chosen), float(before.sum())
-        return Round(before, left, len(before), total, decisions.FAMILY_LEAST**2 * torque)
+        return Round(before, left, len(before), total, decisions.LEAST_TERM**2 * torque)
 
     def cost(i: int) -> tuple[int, int]:
         return every.simplicity(i)

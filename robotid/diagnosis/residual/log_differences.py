@@ -24,7 +24,7 @@ def unlike_log(sample: Sample) -> "OtherLogs | None":
     logs, log_of = list(dict.fromkeys(paths)), np.repeat(paths, [len(k) for k in sample.taken])
     if len(logs) < 2:
         return None
-    each = [_Products.of(sample, np.flatnonzero(log_of == log)[::2]) for log in logs]
+    each = [_Products.of(sample, log_of == log) for log in logs]
     total, rows = sum(x.all for x in each), sum(x.rows for x in each)
     others = [
         OtherLogs.of([path == log for path in paths], total - x.all, rows - x.rows, sample.share)
@@ -79,13 +79,13 @@ class OtherLogs:
     @classmethod
     def of(cls, is_out: Sequence[bool], products: Array, rows: Array, share: float) -> "OtherLogs":
         """Return the fit to products (n, b + 1, b + 1) of the other logs' rows (n,)."""
-        scale = (rows > 0).astype(float)
-        for _ in range(2):  # the noise of each joint in the second fit is the residual of the first
+        change = np.zeros(products.shape[-1] - 1)
+        for _ in range(2):  # the noise of each joint is its residual in the fit before
+            noise = np.sqrt(_squares(products, change) / np.maximum(rows * share, 1.0))
+            scale = np.divide(1.0, noise, out=np.zeros_like(noise), where=noise > 0.0)
             P = np.tensordot(scale**2, products, axes=1)
             L = np.linalg.cholesky(P[:-1, :-1] + np.eye(len(P) - 1))
             change = np.linalg.solve(L.T, np.linalg.solve(L, P[:-1, -1]))
-            noise = np.sqrt(_squares(products, change) / np.maximum(rows * share, 1.0))
-            scale = np.divide(1.0, noise, out=np.zeros_like(noise), where=noise > 0.0)
         return cls(is_out, change, L, scale, share)
 
     def excess(self, own: _Products) -> Array:

@@ -13,6 +13,7 @@ import numpy as np
 
 from robotid.base.findings import Finding, listed, toml_key
 from robotid.base.typing import Array
+from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import codes_with, finding, is_cause
 from robotid.diagnosis.residual.term_trials import Sample, Trials
@@ -23,8 +24,7 @@ from robotid.robot.drives import FAMILIES, Harmonic, drive_line, has_turned
 
 _RIPPLES = np.arange(5, 241)  # periods per revolution tested: 200 of a gear of 100 : 1
 _PEAKS = 6  # of them are tested: those with the largest periodic residual
-_STEEP = 8  # twice the order of the filter, which is applied in both directions
-_REVERSES = 0.05  # of the RMS value: width of a change of a coupling's direction or a gear's side
+_STEEP = 2 * SignalSettings.order  # of the filter, which is applied in both directions
 _WINDUP = (0.02, 0.1)  # of the RMS displacement since a reversal: decay of a deflection
 _OF_POSITION = ("position_periodic", "spring", "position_offset")
 _OF_FORCE = ("gravity", "moving_gravity", "external_force")
@@ -113,7 +113,7 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
             trend_error = float(np.sqrt(per_minute @ accepted.covariance @ per_minute))
             trend = float(per_minute @ theta), trend_error
         families = [name for name in best.families if has_turned(name, angle)]
-        if np.sqrt(accepted.share) * error >= decisions.MISFIT_REPORTED:
+        if np.sqrt(accepted.share) * error >= decisions.LEAST_TERM:
             yield Misfit(
                 sample.joints[j], best, accepted.share, accepted.p_value, accepted.confirmed,
                 size, std_error, (best.units or ("N m rms", "N rms"))[int(is_prismatic)], error,
@@ -210,12 +210,15 @@ def ripples(m: JointMotion, weight: Array, r: Array) -> tuple[Candidate, ...]:
     )  # fmt: skip
 
 
+def _sense(m: JointMotion, of: Callable[[JointMotion], Array]) -> Array:
+    """Return the sign of a signal, shape (N,), continuous where it is about 0."""
+    return np.asarray(np.tanh(of(m) / (decisions.ZERO * _rms(m, of))))
+
+
 def _windup(m: JointMotion) -> Array:
     displacement = m.travelled[:, None] / (np.array(_WINDUP) * _rms(m, attrgetter("travelled")))
     deflection = m.direction[:, None] * np.exp(-displacement)
-    return np.column_stack(
-        [deflection, np.tanh(m.load / (_REVERSES * _rms(m, attrgetter("load"))))]
-    )
+    return np.column_stack([deflection, _sense(m, attrgetter("load"))])
 
 
 def _drift(m: JointMotion) -> Array:
@@ -226,13 +229,11 @@ def _coupled(m: JointMotion, other: str, ratio: float) -> Array:
     """Return columns of a drive at the speed w = v + ratio v' of both joints, at the first."""
 
     def drive_speed(motion: JointMotion) -> Array:
-        return motion.v + ratio * motion.others[other].v
+        return motion.v + ratio * motion.others[other].v if other in motion.others else motion.v
 
-    if other not in m.others:  # it is at rest
-        none = np.zeros_like(m.v)
-        return np.column_stack([none, none, np.tanh(m.v / (_REVERSES * _rms(m, drive_speed)))])
-    partner, w = m.others[other], drive_speed(m)
-    return np.column_stack([partner.a, partner.v, np.tanh(w / (_REVERSES * _rms(m, drive_speed)))])
+    partner, rest = m.others.get(other), np.zeros_like(m.v)
+    own = (rest, rest) if partner is None else (partner.a, partner.v)
+    return np.column_stack([*own, _sense(m, drive_speed)])
 
 
 #: The candidates of each joint, without couplings and ripples, an entry each.

@@ -17,15 +17,13 @@ import numpy as np
 
 from robotid.base.tolerances import REMAINDER, TINY
 from robotid.base.typing import Array
-from robotid.diagnosis.decisions import GROWN, STEP
+from robotid.diagnosis.decisions import GROWN, SETTLED, STEP
 from robotid.diagnosis.residual.misfit import Misfit
 from robotid.diagnosis.residual.term_trials import RIDGE, Sample, Trial, Trials, take_sample
 from robotid.dynamics.torque import drive_motion_along
 from robotid.estimation.fitting.drive_terms import DriveChoice, JointMotion, OpenTerm
 from robotid.estimation.fitting.fitted import Fit, Solution
 from robotid.robot.drive_term import DriveMotion, DriveTerm
-
-_MOVES = 0.2  # change of a shape in standard errors above which the fit is repeated
 
 
 def with_model_error(
@@ -122,7 +120,7 @@ def settled_shapes(fit: Solution) -> tuple[DriveChoice, ...] | None:
             farthest = max(farthest, float((np.abs(after - before) / errors).max()))
             choice = moved
         drives.append(choice)
-    return tuple(drives) if farthest > _MOVES else None
+    return tuple(drives) if farthest > SETTLED else None
 
 
 def _of_undecided(fit: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> Iterator[_Move]:

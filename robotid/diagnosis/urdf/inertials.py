@@ -23,7 +23,8 @@ from robotid.robot.tree import Inertial, Tree, exact_angle, numbers
 _OF_MASSES = (
     "current_for_torque", "joint_origin", "payload", "torque_scale", "total_mass", "urdf_mismatch",
 )  # fmt: skip
-_DENSEST, _LIGHTEST = 20_000.0, 10.0  # [kg/m^3] over the box: about solid tungsten, and foam
+DENSEST = 12_000.0  # [kg/m^3] of a link: lead has 11,340
+_LIGHTEST = 10.0  # [kg/m^3] over the box: foam
 _LONGEST = np.sqrt(5.0)  # ellipsoid of a body with its mass on two sides, over the box
 _SLENDER = 1.6  # ellipsoid over the length that the kinematics give; a uniform rod has 1.29
 _THIN = 0.01  # [m] least side of a box, so that thin sheets have a volume
@@ -225,10 +226,10 @@ def _against_geometry(body: str, J: Array, points: Array) -> Iterator[Finding]:
             high=_metres(high), outside=outside,
         )  # fmt: skip
     density = mass / float(np.prod(sides))
-    if not _LIGHTEST <= density <= _DENSEST:
+    if not _LIGHTEST <= density <= DENSEST:
         yield finding(
             "density", **of_link, sides=_metres(sides), mass=mass, density=density,
-            least=_LIGHTEST, most=_DENSEST,
+            least=_LIGHTEST, most=DENSEST,
         )  # fmt: skip
     second = np.trace(J[:3, :3]) / mass - float(centre @ centre)  # mean square distance
     farthest = float(np.max(np.sum((points - centre) ** 2, axis=1))) ** 0.5

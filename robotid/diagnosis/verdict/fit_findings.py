@@ -8,13 +8,20 @@ from pathlib import Path
 import numpy as np
 
 from robotid.base.findings import Finding, listed
-from robotid.base.tolerances import TINY
+from robotid.base.tolerances import CONVERGED, TINY
 from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import NO_ERROR_OF_MASSES, SHARE_OF_ROWS, TENFOLD
+from robotid.diagnosis.decisions import (
+    DIFFERS,
+    LEAST_SHARE,
+    NO_ERROR_OF_MASSES,
+    SHARE_OF_ROWS,
+    TENFOLD,
+    ZERO,
+)
 from robotid.diagnosis.residual.misfit import Misfit, misfit_finding
-from robotid.diagnosis.urdf.inertials import audit_bodies
+from robotid.diagnosis.urdf.inertials import DENSEST, audit_bodies
 from robotid.diagnosis.verdict.parameter_table import correlated_parameters
 from robotid.diagnosis.verdict.verdict import BEATEN, NAMED, SMALL, is_harmless_cost
 from robotid.estimation.estimators.consistent_fit import slabs
@@ -33,15 +40,9 @@ from robotid.robot.bodies import (
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
-_BIASED = 0.5, 2.0  # shift of a parameter by encoder noise, in standard errors: note, warning
-_COARSE = 0.1  # share of encoder noise over the largest one, from which a joint is named
-_SHRUNK = 0.1  # of the URDF's smallest eigenvalue: below, a body is barely possible ...
-_MUCH = 0.2  # ... if links on locked joints have more than this share of its mass
+_BIASED = 0.5  # shift of a parameter by encoder noise, in standard errors, that is reported
 _USER_BOUNDS = ("mass ", "total_mass ", "centre_of_mass ")
-_DENSEST = 12_000.0  # [kg/m^3] of a link: lead has 11,340
 _UNLIKELY = 0.05  # share of the bodies that the errors allow below which one is not possible
-_AT_BOUND = 1e-3  # relative difference of a mass from a stated bound that determines it
-_VANISHED = 0.05  # share of a link's URDF mass below which the link has practically vanished
 
 
 def fit_findings(
@@ -186,7 +187,7 @@ def not_written(log_errors: Sequence[Finding], inconsistent: str = "") -> Iterat
 
 
 def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]:
-    """Return a warning about locked joints whose positions matter but were not stated."""
+    """Return a warning about locked joints whose positions matter but were not given."""
     # A position matters on a chain with an identified joint; on a floating base all matter.
     relevant = set(model.locked) if model.free_flyer else _in_line(model)
     assumed = [name for name in model.locked if name not in stated and name in relevant]
@@ -262,15 +263,15 @@ def encoder_noise(fit: Fit) -> Iterator[Finding]:
     is_inertial = fit.mapping.K[:, : model.layout.n_inertial].any(axis=1)
     moved = np.where(is_inertial, np.abs(noise.shift) / noise.std_error, 0.0)
     worst = int(np.argmax(moved))
-    if moved[worst] < _BIASED[0]:
+    if moved[worst] < _BIASED:
         return
-    coarse = np.flatnonzero(noise.share > _COARSE * noise.share.max())
+    coarse = np.flatnonzero(noise.share > LEAST_SHARE * noise.share.max())
     steps = {model.joints[j]: noise.steps[j] for j in coarse}
     coarsest = max(steps, key=lambda joint: steps[joint])
     is_prismatic = coarsest in model.layout.prismatic
     yield finding(
         "encoder_noise", subject=listed(steps), names=listed(steps, 4), step=steps[coarsest],
-        severity="warning" if moved[worst] >= _BIASED[1] else "note", std_errors=moved[worst],
+        severity="warning" if moved[worst] >= QUANTILE else "note", std_errors=moved[worst],
         unit="m" if is_prismatic else "rad", bits_of=not is_prismatic,
         bits=np.log2(2 * np.pi / steps[coarsest]), share_pct=100 * noise.share.max(),
         parameter=fit.mapping.base_names[worst], effect=noise.is_corrected,
@@ -322,20 +323,20 @@ def _dense_bodies(fit: Fit) -> Iterator[Finding]:
     before, after = (pi[:size].reshape(-1, 10) for pi in (fit.prior, fit.standard))
     for k, (body, was, now) in enumerate(zip(fit.model.layout.bodies, before, after, strict=True)):
         density = least_density(now)
-        if density <= max(_DENSEST, least_density(was)):
+        if density <= max(DENSEST, least_density(was)):
             continue
         # at equal inertia the density is proportional to the mass to the power of 2.5
-        excess = float(now[0]) * (1.0 - (_DENSEST / density) ** 0.4)
+        excess = float(now[0]) * (1.0 - (DENSEST / density) ** 0.4)
         rows = slice(10 * k, 10 * k + 10)
         covariance = fit.standard_covariance[rows, rows]
-        share = density_share(now, covariance, _DENSEST, np.random.default_rng(0))
+        share = density_share(now, covariance, DENSEST, np.random.default_rng(0))
         is_open = share > _UNLIKELY and not _stated_of(fit, body)
         is_finite = bool(np.isfinite(density))
         yield finding(
             "dense_body", subject=f"link {body}", severity="note" if is_open else "warning",
             link=body, error=is_open, needs="finite" if is_finite else "none",
             conclusion=is_open, cure=_cure(fit, body, excess), mass=now[0], density=density,
-            rounded=float(f"{density:.2g}") if is_finite else 0.0, densest=_DENSEST,
+            rounded=float(f"{density:.2g}") if is_finite else 0.0, densest=DENSEST,
             share=share, half_width=QUANTILE * np.sqrt(covariance[0, 0]),
         )  # fmt: skip
 
@@ -357,7 +358,7 @@ def _stated_of(fit: Fit, body: str) -> dict[str, float]:
     if body in bounds.masses:
         stated, pair = f"mass of {body}", bounds.masses[body]
         mass = float(masses[layout.bodies.index(body)])
-    is_at = pair is not None and np.isclose(mass, pair, rtol=_AT_BOUND).any()
+    is_at = pair is not None and np.isclose(mass, pair, rtol=CONVERGED).any()
     return {stated: mass} if is_at else {}
 
 
@@ -384,7 +385,7 @@ def _locked_links(fit: Fit) -> str:
         np.linalg.eigvalsh(pseudo_inertia(pi[:size] - held))[:, 0]
         for pi in (identified, model.standard_parameters())
     )
-    is_shrunk = (own < _SHRUNK * before) & (held[::10] > _MUCH * identified[::10])
+    is_shrunk = (own < DIFFERS * before) & (held[::10] > DIFFERS * identified[::10])
     return "".join(
         f"the URDF's inertials of the links on locked joints, {held[10 * k]:.3g} kg of the "
         f"{identified[10 * k]:.3g} kg of {model.layout.bodies[k]} (identify their joints, too, if "
@@ -403,7 +404,7 @@ def _contradiction(fit: Fit) -> tuple[str, dict[str, str]]:
     masses, before = (pi[: layout.n_inertial : 10] for pi in (fit.standard, urdf))
     vanished = [
         f"{layout.bodies[k]} has {masses[k]:.2g} of its {before[k]:.3g} kg"
-        for k in np.flatnonzero(masses < _VANISHED * before)
+        for k in np.flatnonzero(masses < ZERO * before)
     ]
     return ("vanished", {"vanished": ", ".join(vanished)}) if vanished else ("harmless", {})
 

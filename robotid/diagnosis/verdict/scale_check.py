@@ -14,7 +14,7 @@ from robotid.base.findings import listed
 from robotid.base.tolerances import TINY
 from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import sentence_of
-from robotid.diagnosis.decisions import AGREES, BETTER, DIFFERS
+from robotid.diagnosis.decisions import AGREES, BETTER, BEYOND_NOISE, DIFFERS, ZERO
 from robotid.dynamics.constraint_rows import loop_basis, without_forces
 from robotid.dynamics.torque import joint_torque_regressor, predict
 from robotid.estimation.fitting.fitted import Fit
@@ -23,12 +23,9 @@ from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.prior import assumed_masses
 
 _POSES = 300  # at which gravity is compared
-_LOADED = 0.02  # share of the largest gravity torque above which a joint is compared
 _HELD_BACK = 1.5  # residual over that of WLS beyond which the prior determines the result
 _ANOTHER = 0.25  # difference of gravity and total mass from which on they contradict the scale
-_CLEARLY = 4.0  # distance of a common factor from 1 over the share of gravity that it leaves
 _TOTAL = "total mass"
-_ABSORBS = 0.1  # share of a change of a stated mass that a link takes up to be named
 
 
 class KnownMass(ABC):
@@ -216,7 +213,7 @@ class ScaleCheck:
         """Whether one common factor explains gravity: the scale is wrong, not single masses."""
         by_factor, by_payload = self.unexplained
         return (
-            abs(self.factor - 1.0) > max(DIFFERS, _CLEARLY * by_factor)
+            abs(self.factor - 1.0) > max(DIFFERS, BEYOND_NOISE * by_factor)
             and by_factor < BETTER * by_payload
             and not self._is_urdf
         )
@@ -285,7 +282,7 @@ class ScaleCheck:
 
     @property
     def _is_total_open(self) -> bool:
-        """Whether the total mass is stated, and not by torque: it does not count as identified."""
+        """Whether the total mass is given, and not by torque: it does not count as identified."""
         stated = self.stated
         return stated is not None and stated.ratio is None and "total_mass" in stated.names
 
@@ -361,7 +358,7 @@ def check_scale(fit: Fit) -> ScaleCheck:
     K = fit.mapping.K * at_rest
     covariance = K @ fit.standard_covariance @ K.T
     gravity, error, known = {}, {}, []
-    for j in np.flatnonzero(load > _LOADED**2 * load.max()).tolist():
+    for j in np.flatnonzero(load > ZERO**2 * load.max()).tolist():
         w = of_urdf[:, j] @ G[:, j] / load[j]  # (b,), ratio = w beta
         spread = float(np.sqrt(max(w @ covariance @ w, 0.0)))
         if spread < DIFFERS:
@@ -473,7 +470,7 @@ def _checked(fit: Fit, names: Sequence[str], C: Array, widths: Array) -> StatedM
     if not np.linalg.norm(o) > TINY:
         change = np.abs(free.sum(axis=0) * spread)[: model.layout.n_inertial : 10]
         shares = change / change.sum()
-        links = [x for x, part in zip(model.layout.bodies, shares, strict=True) if part > _ABSORBS]
+        links = [x for x, part in zip(model.layout.bodies, shares, strict=True) if part > DIFFERS]
         return StatedMass(tuple(names), absorbed_by=tuple(links))
     sums = Z @ o / (o @ o)  # (k,), of the claims
     M = sums @ claims @ inverse  # (b,)

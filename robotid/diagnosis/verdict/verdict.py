@@ -21,7 +21,8 @@ from robotid.estimation.fitting.evaluation import JointMetrics, Metrics, logs_th
 
 GOOD = 15.0  # [%] largest torque prediction error on validation logs of a joint that is "good"
 POOR = 50.0  # [%] a joint with a larger torque prediction error is not usable
-GOOD_POSITION, POOR_POSITION = 5.0, 30.0  # [%] the same limits of simulated position errors
+GOOD_POSITION = 5.0  # [%] the same limit of simulated position errors
+POOR_POSITION = 30.0
 #: Error over that of the second-order model from which it is hardly smaller: half the squares.
 HARDLY = 0.7
 BEATEN = 1.05  # A simpler model is better if its error is smaller by this factor ...
@@ -386,7 +387,7 @@ def judge(
     }
     per_joint |= {joint: JointVerdict("not evaluated", (_HIDDEN,)) for joint in hidden}
     if cause_of is not None:
-        notes = [*_largest_error(per_joint, evidence, cause_of), *notes]
+        _explain_largest_error(per_joint, evidence, cause_of)
     errors = {joint: max(one.errors, default=0.0) for joint, one in evidence.items()}
     good = (
         f"torque prediction error on {logs_that_test(predictions.validation)}: at most "
@@ -410,19 +411,18 @@ def _ranked(reasons: Iterable[tuple[int, str]]) -> list[str]:
     return [text for _, text in sorted(reasons, key=lambda reason: reason[0])]
 
 
-def _largest_error(
+def _explain_largest_error(
     per_joint: dict[str, JointVerdict], evidence: Mapping[str, JointEvidence],
     cause_of: Callable[[str], tuple[str, str]],
-) -> list[str]:  # fmt: skip
-    """Add the cause to the good joint with the largest error; return it if all joints are good."""
+) -> None:  # fmt: skip
+    """Add the cause to the good joint with the largest error."""
     good = [joint for joint, verdict in per_joint.items() if verdict.status == "good"]
     if not good:
-        return []
+        return
     last = max(good, key=lambda joint: max(evidence[joint].errors))
     cause, advice = cause_of(last)
     text = f"largest error of the good joints: {'. '.join(filter(None, (cause, advice)))}"
     per_joint[last] = replace(per_joint[last], reasons=(*per_joint[last].reasons, text))
-    return [f"{last}: largest error: {cause}"] if len(good) == len(per_joint) else []
 
 
 def concluded(

@@ -254,7 +254,7 @@ class Simulation(Settings):
 def by_joint(
     value: PerJoint | None, joints: Sequence[str], name: str, other: ArrayLike = 0.0
 ) -> Array:
-    """Return a setting of each joint, shape (n,): other if it is not stated."""
+    """Return a setting of each joint, shape (n,): other if it is not given."""
     if not isinstance(value, Mapping):
         return np.array(np.broadcast_to(other if value is None else value, len(joints)), float)
     for joint in value:

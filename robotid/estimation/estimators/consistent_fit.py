@@ -302,7 +302,7 @@ class Consistent(BatchEstimator):
 
     @property
     def weight_ratio(self) -> float:
-        """Weight of the prior over its plausible weight, by which errors are stated, at least 1."""
+        """Weight of the prior over its plausible weight, by which errors are given, at least 1."""
         return max(self.prior_weight / self.plausible_weight, 1.0)
 
     @property

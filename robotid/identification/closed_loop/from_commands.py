@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from robotid.base.exceptions import DataError, NotConvergedError, SettingsError
-from robotid.base.findings import Finding, by_severity, listed, quoted
+from robotid.base.findings import Finding, by_severity, grouped, listed, quoted
 from robotid.base.tolerances import LEAST_DIVISOR
 from robotid.base.typing import Array, ProgressCallback, ignore_progress, report_stage
 from robotid.data.log import Log, Trajectory
@@ -250,7 +250,7 @@ def identify_loops(
         standard_covariance=covariance, base=mapping.to_base(standard),
         base_error=_errors(mapping.K @ covariance @ mapping.K.T), loop=loop, estimator=settings,
         fit=fitted, fitted=tuple(runs[0]), validation=tuple(runs[1]),
-        log_errors=tuple(finding.message for finding in errors),
+        log_errors=tuple(m for cause in grouped(errors) for m in cause.messages),
         stated=StatedSettings(used, ignore=tuple(ignore)),
         variation=vary([log.name for log in logs], of_logs, sorted(set(units))),
     )  # fmt: skip

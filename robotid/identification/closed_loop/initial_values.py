@@ -358,7 +358,7 @@ def likeness(model: RobotModel) -> list[tuple[object, ...]]:
 
 
 def is_stated(value: PerJoint | str | None, model: RobotModel) -> Array:
-    """Return whether a number is stated for each joint, shape (n,), bool."""
+    """Return whether a number is given for each joint, shape (n,), bool."""
     named = value if isinstance(value, Mapping) else () if value is None else model.joints
     return np.isin(model.joints, list(named))
 

@@ -533,7 +533,7 @@ def _check_logs(logs: Sequence[Log], loop: LoopSettings, settings: SimulationSet
 
 
 def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:
-    """Return the loops as stated, with the URDF's bodies; kp is 1 where it is not stated."""
+    """Return the loops as stated, with the URDF's bodies; kp is 1 where it is not given."""
     n = len(model.joints)
     default = {"kp": 1.0, "kd": 0.0, "limit": np.inf, "delay": 0.0}
     stated = {name: getattr(loop, name) for name in default}

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from robotid.base.findings import Cause, grouped, listed, toml_key
 from robotid.base.settings import is_number
+from robotid.data.units import STILL
 from robotid.diagnosis.catalogue import entries as catalogue_entries
 from robotid.diagnosis.catalogue import step_of
 from robotid.diagnosis.residual.misfit import setting_of, with_entries
@@ -266,18 +267,21 @@ def _payload_gains(found: TorqueIdentification, payload: PayloadCheck | None = N
 
 def _gains(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     joints = dict.fromkeys((j for cause in causes for j in cause.joints), "GAIN")
-    names = listed(joints or ["the joints"], NAMED)
-    return _step("gains", origin, _payload_gains(found), joints or {"JOINT": "GAIN"}, joints=names)
+    findings = [f for cause in causes for f in cause.findings if f.code == "current_for_torque"]
+    factors = [f"{f.evidence['factor']:.3g} x" for f in findings if "factor" in f.evidence]
+    return _step(
+        "gains", origin, _payload_gains(found), joints or {"JOINT": "GAIN"},
+        joints=listed(joints or ["the joints"], NAMED),
+        scales=f" ({listed(factors, NAMED)})" if factors else "",
+    )  # fmt: skip
 
 
 def _locks(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    joints = list(found.model.locked)
-    places = {
-        finding.joints[0]: f"{finding.evidence['median']:.4g}"
-        for cause in causes
-        for finding in cause.findings
-        if "median" in finding.evidence
-    }
+    joints, findings = list(found.model.locked), [f for cause in causes for f in cause.findings]
+    if any(finding.evidence.get("range", 0.0) > STILL for finding in findings):
+        return _as_found(found, origin, causes)
+    logged = [finding for finding in findings if "median" in finding.evidence]
+    places = {finding.joints[0]: f"{finding.evidence['median']:.4g}" for finding in logged}
     values = places or dict.fromkeys(joints if len(joints) <= NAMED else ["*"], "POSITION")
     return _step("locks", origin, (), values, joints=listed(places or joints, NAMED))
 

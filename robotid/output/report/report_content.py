@@ -101,8 +101,6 @@ def page_of(found: Identification, report: Report, origin: Origin, files: Mappin
     appendix = "".join(folded(key, title, html) for key, (title, html) in parts if html)
     causes = grouped(found.findings, rows)
     findings = "".join(map(_cause, causes)) or "<p>None.</p>\n"
-    notes = [cause for cause in causes if cause.severity == "note"]
-    serious = [cause for cause in causes if cause.severity != "note"]
     worst = escape(next(iter(worst_errors(report.counted)), ""))
     sections = {
         "errors": Section(
@@ -111,7 +109,7 @@ def page_of(found: Identification, report: Report, origin: Origin, files: Mappin
             f"{len(verdicts)} joints, by recording",
             False,
         ),
-        "findings": Section("Findings", findings, tally(serious, notes, worst) or "none", False),
+        "findings": Section("Findings", findings, tally(causes, worst) or "none", False),
         "friction": Section("Friction against speed", report.friction, "of each joint", False),
         "curves": Section(*report.curves),
         "why": Section("Residual analysis", report.why, "torque components of each joint", False),
@@ -165,7 +163,6 @@ def _cause(cause: Cause) -> str:
     return block(
         "report.cause",
         severity=cause.severity,
-        key=escape(cause.code),
         code=code(cause.code).html,
         about=f": {escape(', '.join(cause.joints))}" if cause.joints else "",
         messages="".join(f"<p>{escape(message)}</p>\n" for message in cause.messages),

@@ -66,7 +66,7 @@ TORQUE = Quantity(
     "100 |τ − prediction| / |τ|",
     (GOOD, POOR),
     {
-        "wls": Baseline("WLS", "tone-7"),
+        "wls": Baseline("least squares", "tone-5"),
         "urdf_with_drives": Baseline("URDF + drives", "tone-3"),
         "urdf": Baseline("URDF", "urdf"),
         "gravity_only": Baseline("gravity only", "quiet"),
@@ -77,7 +77,7 @@ POSITION = Quantity(
     "100 |q − simulated| / |motion|",
     (GOOD_POSITION, POOR_POSITION),
     {
-        "second_order": Baseline("2nd-order model", "tone-7"),
+        "second_order": Baseline("2nd-order model", "tone-3"),
         "rows": Baseline("torque fit", "tone-3"),
         "urdf": Baseline("URDF", "urdf"),
         "command": Baseline("command", "tone-5"),

@@ -230,6 +230,12 @@ def test_a_log_that_is_refused_says_why(changes, reading, fragments):
         message = message[message.index(fragment) :]
 
 
+def test_many_joints_without_columns_are_locked_together():
+    locks = r'other 7 joints .*--joints shoulder,elbow --lock "\*=0", or locked = { "\*" = 0 }'
+    with pytest.raises(DataError, match=locks):
+        read_log(frame(), [*JOINTS, *(f"finger_{k}" for k in range(7))])
+
+
 @pytest.mark.parametrize("joints", [(), "elbow", ("elbow", 3), 5])
 def test_joints_must_be_a_list_of_names(joints):
     with pytest.raises(SettingsError, match="expected a list of at least one name"):

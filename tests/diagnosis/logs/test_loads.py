@@ -1,5 +1,6 @@
 """Another scale of the torques, another robot's URDF, an uninformative torque: told apart."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -185,8 +186,11 @@ def test_a_log_without_a_filter_is_judged_too(ur5):
     signals = replace(SIGNALS, cutoff=None)
     log = exact_log(ur5, truth(ur5), np.random.default_rng(0), samples=800, rate=100.0)
     (clean,) = found(ur5, log, signals)
-    (spoilt,) = found(ur5, delayed(log, 0.03), signals)
+    (spoilt,) = found(ur5, delayed(log, 0.04), replace(signals, torque_delay=0.01))
     assert (clean.severity, spoilt.severity) == ("note", "warning")
+    assert spoilt.evidence["delay"] == pytest.approx(0.03, abs=5e-3)
+    total = re.search(r"set torque_delay = (\S+) \(", spoilt.message)[1]
+    assert float(total) == pytest.approx(0.04, abs=5e-3)  # what is stated is part of it
 
 
 def test_noise_of_a_log_without_a_filter_is_no_delay(ur5):

@@ -13,6 +13,7 @@ from robotid.data.files.read import read_log, write_log
 from robotid.data.signal_settings import LogUnits
 from robotid.diagnosis.logs.check_logs import check_locked, percent_hint
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.output.report.next_steps import Origin, next_steps
 from robotid.robot.drives import DRIVE_TERMS
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -79,8 +80,14 @@ def test_a_joint_that_moves_is_named_and_leads_the_verdict(job, tmp_path):
     (finding,) = found(moving)
     assert finding.evidence["range"] > 0.1
     assert "identify wrist_3_joint, too" in finding.message
+    path = tmp_path / "run.csv"
+    parts = {"identification": LogEntry(path, end=4.0), "validation": LogEntry(path, start=4.0)}
+    moving = replace(moving, **{part: (entry,) for part, entry in parts.items()})
     identification, _ = run_job(moving, tmp_path / "out")
-    assert identification.verdict.reasons[0] == finding.message
+    assert ["is locked" in x for x in identification.verdict.reasons].index(False) == 1
+    (step, *_) = next_steps(identification, Origin(("job.toml",)))
+    assert "identify wrist_3_joint, too" in step.words
+    assert not step.blocks
 
 
 def test_positions_and_ranges_have_the_unit_of_their_joint():

@@ -11,6 +11,7 @@ from helpers import misfits as helper
 from helpers.fitting import fit
 from helpers.misfits import EFFECTS
 from helpers.paths import ROOT
+from helpers.single_joint import slider
 
 from robotid.base.findings import Finding
 from robotid.cli.doctor import doctor
@@ -184,6 +185,18 @@ def test_a_ripple_is_named_with_its_periods_a_turn_and_the_terms_that_predict_it
     assert error(found) > 10.0
     assert error(better) < 4.0  # the torque's noise is 2 %
     assert better.misfits == ()
+
+
+def test_coulomb_friction_that_a_rail_lacks_is_a_force(tmp_path):
+    logs = logs_of(slider(tmp_path), 1)
+    lacking = slider(tmp_path, terms=("armature", "viscous", "offset"))
+    found, *_ = misfits(fitted(lacking, logs, signals=SignalSettings(min_velocity=0.03)))
+    assert (found.term.code, found.unit) == ("friction_shape", "N rms")
+    v, used = logs[0].v[:, 0], np.abs(logs[0].v[:, 0]) > 0.03
+    X = np.column_stack([np.gradient(v, logs[0].t), v, np.ones_like(v), np.sign(v)])[used]
+    *_, coulomb = np.linalg.lstsq(X, logs[0].tau[used, 0], rcond=None)[0]
+    alone = X[:, 3] - X[:, :3] @ np.linalg.lstsq(X[:, :3], X[:, 3], rcond=None)[0]
+    assert found.size == pytest.approx(coulomb * np.sqrt(np.mean(alone**2)), rel=0.05)
 
 
 @pytest.mark.parametrize("memory", [0, 50])

@@ -280,6 +280,14 @@ def test_only_findings_that_take_assumed_masses_as_evidence_are_explained(tmp_pa
     upper, lower = none.standard_parameters()[:20].reshape(2, 10)  # boxes of 1000 kg/m^3
     np.testing.assert_allclose(lower, [1, 0, 0, 0, *0.02 / 12 * np.array([1, 0, 1, 0, 0, 1])])
     np.testing.assert_allclose(upper[[0, 1, 6]], [6, 1.5, 6 * (0.37 / 12 + 0.25**2)])
+    head, _, rest = CLEAN.partition("</inertial>")
+    (tmp_path / "held.urdf").write_text(head.partition("<inertial>")[0] + rest)
+    with_lower, alone = (  # of the upper arm, whose locked lower arm keeps its inertial
+        with_assumed_inertials(RobotModel.from_urdf(tmp_path / name, locked={"elbow": 0.0}))
+        for name in ("held.urdf", "none.urdf")
+    )
+    held = with_lower.standard_parameters() - alone.standard_parameters()
+    np.testing.assert_allclose(held[[0, 1, 6]], [1, 0.7, 0.03 + 0.7**2])
 
 
 # --- inertials against the geometry ---------------------------------------------------------------

@@ -122,7 +122,7 @@ def test_the_good_joint_with_the_largest_error_has_the_cause_of_its_residual():
     fit = Metrics({name: joint(5.0) for name in "ab"}, 1.0)
     found = judge(Predictions(fit, logs), Determined(), cause_of=causes.__getitem__)
     assert found.status == "good"
-    assert found.reasons[1:] == ("b: largest error: it is noise",)
+    assert not any("noise" in reason for reason in found.reasons), "the report has it"
 
 
 def test_a_doubt_makes_its_joint_and_the_whole_usable_at_best():

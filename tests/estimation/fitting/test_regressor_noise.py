@@ -149,6 +149,9 @@ def test_the_shift_is_what_many_encoders_move_least_squares_by(runs, planar, mot
     assert shift[:, worst].mean() == pytest.approx(mean[worst], rel=0.15)
     rare = found_in(planar, recorded(planar, [x[::12] for x in motion]))  # most rows differ
     np.testing.assert_allclose([noises[0].steps, rare.steps], STEP)
+    a, exact = (process(recorded(planar, motion, step=step), SIGNALS).a for step in (STEP, 0))
+    share = np.std(a - exact, axis=0) / np.sqrt(np.mean(exact**2, axis=0))
+    np.testing.assert_allclose(noises[0].share, share, rtol=0.2)  # rounding is nearly white noise
 
 
 def test_intervals_hold_the_truth_behind_the_correction_and_not_without_it(runs):

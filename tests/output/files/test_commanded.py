@@ -110,7 +110,7 @@ def test_a_delay_is_exact_to_a_step(late):
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     leg = plant("leg", np.random.default_rng(0), coulomb=0.2, offset=0.1, zero=0.02, delay=0.0063)
-    drives = (*leg.drives[:2], replace(leg.drives[2], kp=33.0, coulomb=0.4, delay=0.0048))
+    drives = (*leg.drives[:2], replace(leg.drives[2], kp=33.0, coulomb=0.4, delay=0.0036))
     same = replace(drives[0], joint=LEG[1])
     leg = replace(leg, drives=(drives[0], same, drives[2]))
     friction = {LEG[2]: by_position(0.05, 0.3, -2.5, -1.0)}
@@ -237,7 +237,7 @@ def test_isaac_actuators_are_grouped_and_read_back(result, tmp_path, capsys):
             "friction": pytest.approx(drive.coulomb + by_position[joint], rel=1e-5),
             "dynamic_friction": pytest.approx(drive.coulomb + by_position[joint], rel=1e-5),
             "viscous_friction": pytest.approx(drive.viscous, rel=1e-5),
-            "min_delay": 3 if joint != LEG[2] else 2,  # 3.15 and 2.4 steps
+            "min_delay": 3 if joint != LEG[2] else 2,  # 3.15 and 1.8 steps
             "max_delay": 3 if joint != LEG[2] else 2,
         }
 

@@ -198,7 +198,9 @@ def test_an_error_comes_before_a_warning_and_three_steps_are_enough(identified):
 
 
 SETTINGS = {
-    "current_for_torque": ([{}], "[torque.gains]\nelbow_joint = GAIN", "--gain elbow_joint=GAIN"),
+    "current_for_torque": (
+        [{"factor": 31.6}], "[torque.gains]\nelbow_joint = GAIN", "--gain elbow_joint=GAIN",
+    ),
     "torque_delay": (
         [{"delay": 0.0041}, {"delay": 0.0061}], "[signals]\ntorque_delay = 0.0051",
         "--torque-delay 0.0051",
@@ -213,6 +215,7 @@ def test_a_setting_is_a_line_of_the_job_file_or_a_flag(identified, code):
     block, *of_payload = next_steps(found, FLAGS)[0].blocks
     assert block == f"robotid identify arm.urdf first.csv --cutoff 8 {flags} --out out"
     assert len(of_payload) == (code == "current_for_torque")
+    assert ("another scale (31.6 x)" in next_steps(found, FLAGS)[0].words) == bool(of_payload)
     assert next_steps(found, JOB)[0].blocks == (
         table,
         "robotid identify 'my job.toml' --out out",

@@ -6,9 +6,10 @@ from dataclasses import replace
 from html import unescape
 
 import pytest
-from helpers.pages import charts
+from helpers.pages import charts, tables
 
 from robotid.base.findings import Finding
+from robotid.output.files.entries import build_result
 from robotid.output.report.next_steps import Origin
 from robotid.output.report.report_content import Clip, Dock, Residual, worst_second, write_report
 
@@ -25,13 +26,14 @@ def page_of(found, folder, **options):
     return write_report(found, folder / "page.html", **options).read_text()
 
 
-@pytest.fixture(scope="module")
-def page(found, tmp_path_factory):
-    return page_of(found, tmp_path_factory.mktemp("page"), origin=Origin((), "out"))
-
-
-def test_the_worst_second_is_in_mrad_and_the_replay_knows_when_each_log_ends(found, tmp_path):
+def test_delays_are_in_ms_the_worst_second_in_mrad_and_clips_end_with_their_logs(found, tmp_path):
     page = page_of(found, tmp_path, files={"replay": "replay.html"})
+    delay = next(
+        e for e in build_result(found, {})["drive_parameters"] if e["name"] == "turn.delay"
+    )
+    value, error = (f"{1e3 * delay[key]:.3f}" for key in ("value", "std_error"))
+    drives = tables(page)["Drives, by joint"].by_name()
+    assert drives["turn"]["delay [ms]"] == f"{value} ± {error}"
     [run] = found.validation
     left = run.log.q[:, 1] - run.q[:, 1]
     worst = worst_second([Residual(run.name, run.log.name, run.log.t, left)])
