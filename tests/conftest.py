@@ -2,6 +2,7 @@ import fcntl
 import gc
 import os
 import sys
+from functools import lru_cache
 from pathlib import Path
 
 # one thread of BLAS per process, before numpy loads it: the workers of pytest-xdist share the cores
@@ -22,6 +23,7 @@ from robotid.cli.identify import identify
 from robotid.data.files.read import read_log, write_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
+from robotid.robot import bodies
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -86,6 +88,15 @@ def pytest_collection_finish():
     gc.freeze()
     gc.set_threshold(20_000)
     gc.enable()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def meshes():
+    """Read each mesh once for the points of bodies: most tests look at the same few robots."""
+    read = lru_cache(64)(lambda path, _, read=bodies.read_surfaces: read(path))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bodies, "read_surfaces", lambda path: read(path, path.stat().st_mtime_ns))
+        yield
 
 
 @pytest.fixture

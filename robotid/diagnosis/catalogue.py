@@ -2,8 +2,9 @@
 
 An entry has the severity, the message as a template, the remedy that follows it, the reason of a
 verdict (``verdict``), whether an error may be ignored (``ignorable``), the next step
-(``step``) and the page of the documentation (``page``, with its ``cause`` and ``about``). Tables of
-an entry have parts of its sentences, of which a word given to ``finding`` chooses one.
+(``step``), the ``stage`` (see ``explanations``) and the page of the documentation (``page``, with
+its ``cause`` and ``about``). Tables of an entry have parts of its sentences, of which a word given
+to ``finding`` chooses one.
 """
 
 import tomllib
@@ -27,11 +28,6 @@ def entries() -> Mapping[str, Mapping[str, Any]]:
 def codes_with(key: str) -> tuple[str, ...]:
     """Return the codes whose entries have a key, in order."""
     return tuple(code for code, entry in entries().items() if key in entry)
-
-
-def is_cause(code: str) -> bool:
-    """Return whether a finding names a cause of a residual."""
-    return entries()[code]["page"] in ("residual", "torques")
 
 
 def step_of(code: str) -> str:

@@ -34,20 +34,19 @@ _AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 def constraint_jacobian(model: RobotModel, q: Array, contacts: Array) -> Array:
     """Return the Jacobian J of a robot's constraints at each sample, 0 of links in the air."""
-    pin_model, G, data = model.pin_model, model.velocity_map, model.pin_model.createData()
+    pin_model, data = model.pin_model, model.pin_model.createData()
     frames = [[frame_id(pin_model, link) for link in x.frames] for x in model.constraints]
     edges = np.cumsum([0, *(x.sizes[x.kind] for x in model.constraints)])
     place = {x: k for k, x in enumerate(model.contacts)}
-    J = np.zeros((len(q), edges[-1], model.n_rows))
+    J = np.zeros((len(q), edges[-1], pin_model.nv))
     for k, q_k in enumerate(np.ascontiguousarray(model.configurations(q))):
         pin.computeJointJacobians(pin_model, data, q_k)
         for x, ids, first, stop in zip(model.constraints, frames, edges, edges[1:], strict=False):
             if x in place and not contacts[k, place[x]]:
                 continue
             own = [pin.getFrameJacobian(pin_model, data, i, _AXES) for i in ids]
-            placement = pin.updateFramePlacement(pin_model, data, ids[0])
-            J[k, first:stop] = x.rows(own, placement) @ G
-    return J
+            J[k, first:stop] = x.rows(own, pin.updateFramePlacement(pin_model, data, ids[0]))
+    return J @ model.velocity_map
 
 
 def contact_links(model: RobotModel, q: Array) -> tuple[Array, Array]:

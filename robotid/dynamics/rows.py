@@ -476,7 +476,7 @@ class _PinocchioWriter:
         wanted, end = [], 0
         self._sources: list[tuple[Array | slice, float, slice, bool]] = []
         for j, (columns, places) in enumerate(zip(plan.inertial, plan.places, strict=True)):
-            for k, r in enumerate(np.flatnonzero(G[:, j])):
+            for k, r in enumerate(np.array([j]) if self._map is None else np.flatnonzero(G[:, j])):
                 wanted.append(size * r + columns)
                 part = slice(end, end := end + len(columns))
                 self._sources.append((_as_slice(places), G[r, j], part, k > 0))
@@ -558,7 +558,7 @@ class _CompiledWriter:
 
 
 def _as_slice(places: Array) -> Array | slice:
-    """Return consecutive places as a slice, for which writing is faster."""
-    if len(places) and (np.diff(places) == 1).all():
+    """Return increasing places as a slice if none is left out: writing is faster then."""
+    if len(places) and places[-1] - places[0] == len(places) - 1:
         return slice(int(places[0]), int(places[-1]) + 1)
     return places

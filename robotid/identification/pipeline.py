@@ -19,6 +19,7 @@ from robotid.data.files.columns import Needs
 from robotid.data.files.read import Readable, read_logs
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.explanations import explained
 from robotid.diagnosis.residual.discrepancies import explain_residual
 from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.residual.misfit import settled
@@ -136,9 +137,10 @@ def conclude(
     # notes, and what the doctor says of excitation and logs, are replaced by those of the fit
     replaced = ("excitation", "log_assumption")
     others = [f for f in doctor_findings if f.severity != "note" and f.code not in replaced]
-    merged = settled(others, of_fit, ignore)
+    merged = settled(others, of_fit)
     merged = [finding for finding in merged if not explained_by_assumed(model, finding)]
     merged = rejected(merged, result.predictions, result.scale_check)
+    merged = explained(merged, model, ignore)
     log_errors = blocking(merged, ignore, is_robust=is_robust)
     heads = [log.head for log in (*recordings.fitted, *recordings.validation)]
     assumed = assumed_inertials(model)  # which the doctor finds, too, if it has run

@@ -228,13 +228,10 @@ def find_mesh(name: str, urdf: str | Path) -> Path | None:
     if is_package and ".." in Path(inside).parts:
         return None
     _, _, without = inside.partition("/")
-    for folder in _folders(Path(urdf)):
-        if os.path.isfile(folder / inside):  # unlike Path.is_file, it never raises
-            return folder / inside
-        # the folder may be that of the package under another name
-        if is_package and without and os.path.isfile(folder / without):
-            return folder / without
-    return None
+    # the folder may be that of the package under another name
+    ends = [inside, without] if is_package and without else [inside]
+    paths = (folder / end for folder in _folders(Path(urdf)) for end in ends)
+    return next(filter(os.path.isfile, paths), None)  # unlike Path.is_file, it never raises
 
 
 def read_surfaces(path: Path) -> tuple[Surface, ...]:
@@ -266,14 +263,18 @@ def read_surfaces(path: Path) -> tuple[Surface, ...]:
 def _folders(urdf: Path) -> Iterator[Path]:
     yield from (Path(p) for p in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if p)
     yield from urdf.resolve().parents
+    yield from _example_folders()
+
+
+@lru_cache
+def _example_folders() -> tuple[Path, ...]:
+    """Return the folders that contain the packages of example-robot-data, if it is installed."""
     try:
-        urdfs = example_urdfs()
+        parents = {folder for path in example_urdfs() for folder in path.parents}
     except MissingDependencyError:
-        return
-    roots = {folder for path in urdfs for folder in path.parents if folder.name == "robots"}
-    for root in sorted(roots):
-        yield root.parent.parent
-        yield root
+        return ()
+    roots = sorted(folder for folder in parents if folder.name == "robots")
+    return tuple(folder for root in roots for folder in (root.parent.parent, root))
 
 
 def _geometry(element: ET.Element) -> tuple[str, tuple[float, ...], str]:

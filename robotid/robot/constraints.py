@@ -113,10 +113,11 @@ class Contact(Settings):
     def rows(self, jacobians: Sequence[Array], placement: pin.SE3) -> Array:
         """Return the velocity that the contact prevents, per speed of the robot, shape (m, nv)."""
         rows = jacobians[0][: self.sizes[self.kind]].copy()  # axes of the world, (6, nv)
-        axes = placement.rotation if self.axes == "link" else np.eye(3)
         rows[0] -= self.radius * jacobians[0][4]  # v + w x (0, 0, -radius)
         rows[1] += self.radius * jacobians[0][3]
-        return np.reshape(axes.T @ rows.reshape(-1, 3, rows.shape[1]), rows.shape)
+        if self.axes == "link":
+            return np.reshape(placement.rotation.T @ rows.reshape(-1, 3, rows.shape[1]), rows.shape)
+        return rows
 
 
 @dataclass(frozen=True)

@@ -153,7 +153,7 @@ class MemorylessTerm(DriveTerm):
     def _shape(self, law: Law | None) -> tuple[float, ...]:
         return () if law is None else tuple(float(getattr(self, name)) for name in _shapes(law))
 
-    @property
+    @cached_property
     def ranges(self) -> tuple[float, float, float]:
         """The largest abs(v) and the range of q outside which it is constant."""
         fastest = self.data_range[1] if self.guards == "v" else np.inf

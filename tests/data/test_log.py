@@ -12,13 +12,7 @@ from helpers.synthetic import sine_log
 
 from robotid.base.exceptions import DataError
 from robotid.data import log as log_module
-from robotid.data.log import (
-    Log,
-    Trajectory,
-    blocks_of,
-    map_stamps,
-    median_step,
-)
+from robotid.data.log import Log, Trajectory, blocks_of, map_stamps, median_step
 
 JOINTS = ("shoulder", "elbow")
 T = 1000.0 + np.arange(500) / 100  # 5 s at 100 Hz

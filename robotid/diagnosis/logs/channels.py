@@ -38,10 +38,10 @@ _LEAST = {"q": STATIC, "dq": AT_REST}  # [rad or m, rad/s or m/s] smaller values
 _BITS = range(9, 24)  # of encoders
 _OTHER = 0.01  # relative difference from which a clock, or the step of an encoder, is another one
 _RPM = 30 / np.pi  # [1/min per rad/s]
-_LONG = 0.05  # [s] a longer gap is a warning
 # [s] A longer rest at an end is reported; in a longer gap, a position that moves as in one step
 # shows that the clock was set.
 _PAUSE = 1.0
+_LONG = 0.05  # [s] a longer gap is a warning
 _LENGTHS = {"mm": 1e-3, "cm": 1e-2}  # [m]
 _HARDLY = {"rad": 0.2, "m": 0.05}  # smaller range: the joint hardly moves
 _AROUND = 9  # rows around one, of the mean torque and of a motion before and after repeated rows

@@ -19,6 +19,7 @@ from robotid.data.signal_settings import LogUnits, SignalSettings
 from robotid.data.units import AT_REST, STILL
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import BETTER, NOTHING, SCATTERED, SEGMENTS, ZERO
+from robotid.diagnosis.explanations import explained
 from robotid.diagnosis.logs import channels
 from robotid.diagnosis.logs.base_checks import check_base
 from robotid.diagnosis.logs.command_channels import check_commands
@@ -34,10 +35,6 @@ from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread, with_assumed_inertials
 
 _ROWS = 5000  # of a log, from which its excitation is computed
-#: Findings on one torque, which another quantity in its column explains.
-_OF_A_DRIVE = ("current_for_torque", "gravity_compensated", "torque_sign", "unexplained_torque",
-               "unsigned_torque")  # fmt: skip
-_BEYOND = ("beyond_limits", "beyond_effort")
 #: Errors of channels after which no model fits the torques.
 _FIT_NO_MODEL = ("time_scale", "unsigned_torque", "constant_torque")
 _FAR = 2 * np.pi  # number in a log above which a position may be a percentage
@@ -67,6 +64,7 @@ def diagnose(
         names = ", ".join(log.name for log in fitted)
         findings += check_excitation(model, mapping, moving, signals, names)
         findings += [x for x in rounded_angles(model, mapping) if x.evidence["felt"]]
+    findings = explained(findings, model)
     return by_severity(x for x in findings if not explained_by_assumed(model, x))
 
 
@@ -139,21 +137,8 @@ def _examine_torques(model: RobotModel, logs: Sequence[_Examined], signals: Sign
         torques = list(check.read(name)) if is_tried else []
         is_read |= bool(torques)
         torques = torques or list(check.loads(name))
-        # a channel that holds another quantity explains what is found of its joint
-        others = [x for x in torques if x.severity == "error" and x.code not in _OF_A_DRIVE]
-        moved = {joint for x in others for joint in x.joints}
         coarse = {joint for x in one.findings if x.code == "quantised" for joint in x.joints}
-        off = [x for x in _drives_off(check.probe, coarse, name) if moved.isdisjoint(x.joints)]
-        beyond = [x for x in one.findings if x.code in _BEYOND]
-        one.findings[:] = [x for x in one.findings if x not in beyond or moved.isdisjoint(x.joints)]
-        errors = [x for x in (*beyond, *off) if x.severity == "error"]
-        named = {joint for x in errors for joint in x.joints} - moved
-        of_all = ("unexplained_torque", "urdf_mismatch") if named else ()
-        torques = [
-            x for x in torques
-            if not (named.issuperset(x.joints) and x.code in (_OF_A_DRIVE if x.joints else of_all))
-        ]  # fmt: skip
-        one.findings += [*off, *torques]
+        one.findings += [*_drives_off(check.probe, coarse, name), *torques]
         if not any(x.severity == "error" for x in torques):
             one.findings += check_torque_delay(model, one.log, signals, name)
 

@@ -201,6 +201,12 @@ class Samples:
         return _over(left, size)
 
     @property
+    def urdf_size(self) -> Array:
+        """Sum of squares of the torque of the URDF's bodies on each joint, (m,)."""
+        c = -self.motion.tau.shape[1] - 1
+        return np.asarray(self.motion.products[..., c, c].sum(axis=0))
+
+    @property
     def unexplained(self) -> Array:
         """The same share of torques with their signs, at most 1, (m,)."""
         m, own = self.motion, self.order[self.motion.rows]

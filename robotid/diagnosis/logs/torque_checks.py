@@ -10,7 +10,7 @@ from robotid.base.tolerances import TINY
 from robotid.base.typing import Array
 from robotid.data.units import STATIC
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import BEYOND_NOISE, NO_ERROR_OF_MASSES, SIGNIFICANT
+from robotid.diagnosis.decisions import BEYOND_NOISE, NO_ERROR_OF_MASSES, SIGNIFICANT, ZERO
 from robotid.diagnosis.logs.probe import Probe
 from robotid.diagnosis.logs.readings import CERTAIN, EXPLAINED, Best, Samples, best_readings, limbs
 
@@ -22,7 +22,6 @@ _MASS, _MOMENT = 20.0, 10.0  # [kg], [kg m] prior standard deviations of a paylo
 _WORSE = 0.25  # allowed increase of a torque's misfit over its own fit, in variances
 _OTHER_UNIT = 30.0  # a common scale of all torques farther from 1 is another unit, no gain
 _SCALES = np.logspace(-3, 3, 61)
-_ALIKE = _SCALES[2] / _SCALES[0]  # ratio below which two factors on this grid are equal
 _WRONG_TILT = 30.0  # [deg] angle of gravity from the stated one that is an error
 _LARGE = 0.08  # payload over the arm's mass that errors of the links do not explain
 _MISMATCH = 7.5  # largest sum of squared errors of the links, in standard deviations
@@ -56,9 +55,9 @@ class TorqueCheck:
 
     def loads(self, name: str) -> Iterator[Finding]:
         """Yield another scale, a load or another robot, and torques that nothing explains."""
-        yield from _check_loads(self.probe, self.share, name)
         moving = [j for samples, _ in self.limbs for j in samples.motion.rows]
         bad = [j for j in moving if self.share[j] > _UNEXPLAINED]
+        yield from _check_loads(self.probe, self.share, name, not bad)
         if 2 * len(bad) > len(self.share):
             yield finding(
                 "unexplained_torque", name, what="robot", joints=len(bad), of=len(self.share),
@@ -83,11 +82,13 @@ def _findings(samples: Samples, found: Sequence[Best], log: str) -> Iterator[Fin
     rows, joints = samples.motion.rows.tolist(), samples.motion.model.joints
     final = found[-1].after if found else np.zeros(len(rows))
     exchanged: dict[str, list[Best]] = {}
-    for one in _with_one_gain(found):
+    for one in found:
         reading = one.reading
         concerned = np.isin(rows, reading.joints) | (not reading.joints)
+        # a joint without any torque of the bodies does not confirm that reading
+        concerned &= one.samples.urdf_size > ZERO * samples.urdf_size
         is_unit = reading.code == "current_for_torque" and not reading.joints
-        if is_unit or np.median(final[concerned]) > EXPLAINED:
+        if is_unit or (concerned.any() and np.median(final[concerned]) > EXPLAINED):
             continue  # a unit of all torques shows in the masses
         if reading.code in _ORDERS:
             exchanged.setdefault(reading.code, []).append(one)
@@ -113,18 +114,6 @@ def _findings(samples: Samples, found: Sequence[Best], log: str) -> Iterator[Fin
             gain=sum(one.gain for one in pairs), unexplained=pairs[0].before.max(),
             unexplained_so_read=pairs[-1].after.max(),
         )  # fmt: skip
-
-
-def _with_one_gain(found: Sequence[Best]) -> Sequence[Best]:
-    """Return readings with gains of joints that are about equal as one."""
-    gains = [one for one in found if one.reading.code == "current_for_torque"]
-    logs = [one.reading.values[0] for one in gains if one.reading.joints]
-    if len(logs) < max(2, len(gains)) or np.ptp(logs) > np.log(_ALIKE):
-        return found
-    joints = tuple(sorted(j for one in gains for j in one.reading.joints))
-    reading = replace(gains[-1].reading, joints=joints, values=(float(np.mean(logs)),))
-    joint = replace(gains[-1], reading=reading, before=gains[0].before)
-    return [*(one for one in found if one not in gains), joint]
 
 
 _ORDERS = ("torque_order", "position_order", "joint_order")
@@ -177,16 +166,16 @@ class LoadModel:
     expected: float  # Misfit of torques that fit as well as with separate parameters for each joint
     independent: float  # Number of independent torques
 
-    def misfits(self, scales: Array) -> Array:
-        """Return the misfits of scaled torques: chi-squares, prior included, shape (T,)."""
-        R = np.asarray(np.linalg.qr(self._rows(scales), mode="r"))  # (T, c+1, c+1)
-        return np.asarray(R[:, -1, -1] ** 2)
+    def misfit(self, scale: float) -> float:
+        """Return the misfit of scaled torques: chi-square, prior included."""
+        R = np.asarray(np.linalg.qr(self._rows(scale), mode="r"))
+        return float(R[-1, -1] ** 2)
 
-    def fit(self, scale: Array) -> tuple[float, Array, Array]:
+    def fit(self, scale: float = 1.0) -> tuple[float, Array, Array]:
         """Fit with the torque columns multiplied by a scale, without negative masses of links."""
         from scipy.optimize import lsq_linear
 
-        rows = self._rows(scale[None])[0]
+        rows = self._rows(scale)
         bounds = np.full(len(self.mean), -np.inf)
         bounds[:-4] = 0.0
         solution = lsq_linear(rows[:, :-1], rows[:, -1], bounds=(bounds, np.inf), method="bvls")
@@ -194,21 +183,18 @@ class LoadModel:
         error: Array = self.spread * np.linalg.norm(inverse, axis=1)
         return 2 * float(solution.cost), self.spread * solution.x, error
 
-    def is_this_robot(self, scale: Array) -> bool:
+    def is_this_robot(self, scale: float = 1.0) -> bool:
         """Return whether scaled torques fit well with masses of the links near the URDF's."""
         chi, theta, _ = self.fit(scale)
         is_good = chi - self.expected < _WORSE * self.independent
         return is_good and _error_of_links(theta) < _MISMATCH
 
-    def _rows(self, scales: Array) -> Array:
-        """Return the rows of torques and prior, columns times the spread, (T, N, c+1)."""
-        c, (T, n) = len(self.mean), scales.shape
-        rows = self.R * np.append(self.spread, 1.0)
-        rows = np.repeat(rows[None], T, axis=0)  # (T, n, c+1, c+1)
-        rows[..., :-1] /= scales[:, :, None, None]
+    def _rows(self, scale: float) -> Array:
+        """Return the rows of torques and prior, columns times the spread, (N, c+1)."""
+        c = len(self.mean)
+        rows = self.R * np.append(self.spread / scale, 1.0)
         prior = np.column_stack([np.eye(c), self.mean / self.spread])
-        prior = np.repeat(prior[None], T, axis=0)
-        return np.concatenate([rows.reshape(T, n * (c + 1), c + 1), prior], axis=1)
+        return np.concatenate([rows.reshape(-1, c + 1), prior])
 
 
 def load_model(probe: Probe, share: Array) -> LoadModel:
@@ -236,27 +222,30 @@ def load_model(probe: Probe, share: Array) -> LoadModel:
     return LoadModel(R, mean, spread, expected, independent * float(used.sum()))
 
 
-def _check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
+def _check_loads(probe: Probe, share: Array, name: str, is_explained: bool) -> Iterator[Finding]:
     """Yield torques in another scale, a payload, a URDF of another robot."""
-    # Another scale must fit with about the URDF's masses; else the URDF is of another robot.
-    model, ones = load_model(probe, share), np.ones(len(share))
-    bodies = len(probe.model.layout.bodies)
-    _, theta, error = model.fit(ones)
-    if not model.is_this_robot(ones):
-        scale = _torque_scales(model)
-        other = np.flatnonzero(np.abs(np.log(scale)) > np.log(NO_ERROR_OF_MASSES))
-        if len(other) and model.is_this_robot(scale):
-            yield from _scaled(probe, scale, _needed(model, scale, other), name)
+    # A common scale must fit with about the URDF's masses; else the URDF is of another robot. All
+    # torques must be explained by some masses: others are no evidence of them.
+    model = load_model(probe, share)
+    _, theta, error = model.fit()
+    if model.is_this_robot():
+        yield from _payload(probe, theta[-4:], float(error[-4]), name) if is_explained else ()
+    elif _is_compensated(probe):
+        yield finding("gravity_compensated", name, what="robot")
+    elif is_explained:
+        scale = _torque_scale(model)
+        if scale != 1.0 and model.is_this_robot(scale):
+            used = [probe.model.joints[j] for j in np.flatnonzero(model.R.any(axis=(1, 2)))]
+            is_all = len(used) == len(share)
+            is_unit = is_all and abs(np.log(scale)) > np.log(_OTHER_UNIT)
+            yield finding(
+                "current_for_torque", name, () if is_all else used, joints=len(used), also=False,
+                severity="error" if is_unit else "warning", factor=scale, joint=listed(used),
+            )  # fmt: skip
             return
-        if _is_compensated(probe):
-            yield finding("gravity_compensated", name, what="robot")
-            return
-        if len(other) or _error_of_links(theta) > _MISMATCH:
-            factors = dict(zip(probe.model.layout.bodies, theta[:bodies].tolist(), strict=True))
-            words = ", ".join(f"{link} {factor:.2g}" for link, factor in factors.items())
-            yield finding("urdf_mismatch", name, factors=words, **factors)
-            return
-    yield from _payload(probe, theta[bodies:], float(error[bodies]), name)
+        factors = dict(zip(probe.model.layout.bodies, theta[:-4].tolist(), strict=True))
+        words = ", ".join(f"{link} {factor:.2g}" for link, factor in factors.items())
+        yield finding("urdf_mismatch", name, factors=words, **factors)
 
 
 def _is_compensated(probe: Probe) -> bool:
@@ -266,53 +255,18 @@ def _is_compensated(probe: Probe) -> bool:
     if not weight.any():
         return False
     whole = TorqueCheck.of(replace(probe, tau=probe.tau + weight))
-    return load_model(whole.probe, whole.share).is_this_robot(np.ones(len(whole.share)))
+    return load_model(whole.probe, whole.share).is_this_robot()
 
 
 def _error_of_links(theta: Array) -> float:
     return float(np.sum(((theta[:-4] - 1.0) / _SPREAD) ** 2))
 
 
-def _torque_scales(model: LoadModel) -> Array:
-    """Return the factors of the torque columns that reduce the misfit significantly, else 1."""
-    # In rounds: all torques by a factor that no errors of masses explain, or one torque more.
-    n, scale = len(model.R), np.ones(len(model.R))
-    common = _SCALES[np.abs(np.log(_SCALES)) > np.log(NO_ERROR_OF_MASSES)]
-    for _ in range(n):
-        one = np.where(np.eye(n, dtype=bool)[:, None], _SCALES[:, None], scale).reshape(-1, n)
-        trials = np.vstack([scale, np.repeat(common[:, None], n, axis=1), one])
-        chi = model.misfits(trials)
-        if chi[0] - chi.min() < SIGNIFICANT**2:
-            break
-        scale = trials[int(np.argmin(chi))]
-    return np.where(model.R.any(axis=(1, 2)), scale, 1.0)
-
-
-def _needed(model: LoadModel, scale: Array, other: Array) -> Array:
-    """Return the joints whose other scale is needed to fit the torques; all if all are scaled."""
-    if len(other) == len(scale):
-        return other
-    smallest = scale.copy()
-    for j in other:
-        without = np.where(np.arange(len(scale)) == j, 1.0, smallest)
-        if model.is_this_robot(without):
-            smallest = without
-    return np.asarray(other[smallest[other] != 1.0])
-
-
-def _scaled(probe: Probe, scale: Array, other: Array, name: str) -> Iterator[Finding]:
-    joints, factors = [probe.model.joints[j] for j in other], scale[other].tolist()
-    if len(other) > 1 and np.ptp(np.log(factors)) < np.log(_ALIKE):
-        factor = float(np.exp(np.log(factors).mean()))
-        is_all = len(other) == len(scale)
-        is_unit = is_all and abs(np.log(factor)) > np.log(_OTHER_UNIT)
-        yield finding(
-            "current_for_torque", name, () if is_all else joints, joints=len(other), also=False,
-            severity="error" if is_unit else "warning", factor=factor, joint=listed(joints),
-        )  # fmt: skip
-        return
-    for joint, factor in zip(joints, factors, strict=True):
-        yield finding("current_for_torque", name, joint, factor=factor, also=False)
+def _torque_scale(model: LoadModel) -> float:
+    """Return the factor of all torques that no errors of masses explain, 1 without one."""
+    far = _SCALES[np.abs(np.log(_SCALES)) > np.log(NO_ERROR_OF_MASSES)]
+    best = float(min(far, key=model.misfit))
+    return best if model.misfit(1.0) - model.misfit(best) > SIGNIFICANT**2 else 1.0
 
 
 def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Finding]:

@@ -32,6 +32,7 @@ _OVERSAMPLED = 8.0  # instants per period of the filter: the regressor has a lar
 _TIMES = 1.5
 _OF_RATE = 0.15
 _SLOW = 0.05  # [rad/s] slower: a drive may be in stiction, and its friction is unknown around
+NEAR = 0.5  # [periods of the job's filter] time over which it smears stiction
 _SETTLED = 1.5  # [periods of the filter] settling time of the filter at an end of a segment
 _HARMONICS = 4  # of a torque that is periodic in the position, as of gears and magnets
 # Share of a torque that is noise even in an exact log, and of the largest singular value that
@@ -198,7 +199,7 @@ def _window(
     at = motion.t[coarse[inner]]
     is_reversal = np.diff(np.sign(v), axis=0, append=np.sign(v[-1:])) != 0
     slow = is_reversal | (np.abs(v) < _SLOW)
-    steady = [distance(at, t[slow[:, j]]) > _SETTLED / 2 * period for j in range(v.shape[1])]
+    steady = [distance(at, t[slow[:, j]]) > NEAR * _TIMES * period for j in range(v.shape[1])]
     tau = low_pass(motion.tau[rows], 1 / step, signals)
     delayed = np.moveaxis(_interpolated(t, tau, at + _GRID[:, None]), 0, 2)  # (N, n, delays)
     drive = np.concatenate([own, coupled], axis=2)  # (N, n, k)

@@ -21,9 +21,10 @@ from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import finding
+from robotid.diagnosis.decisions import Option
 from robotid.diagnosis.residual.log_differences import OtherLogs, unlike_log
 from robotid.diagnosis.residual.misfit import Misfit, find_misfits
-from robotid.diagnosis.residual.term_trials import Accepted, Sample, Trials, along
+from robotid.diagnosis.residual.term_trials import Accepted, Sample, Trials, along, regressor
 from robotid.dynamics.torque import (
     TorqueSlopes,
     body_slopes,
@@ -133,7 +134,6 @@ def _of_robot(
     least = 0.02 * float(np.linalg.norm(GRAVITY)) * pi[: model.layout.n_inertial : 10].sum()
     return (
         Reading("gravity", 0.025, level, lambda on: by.by_gravity @ across.T, tilted),
-        Reading("moving_gravity", 0.025, level, lambda on: g * by.by_gravity, changes=True),
         Reading("moving_gravity", 0.025, level, weighed, changes=True),
         Reading("external_force", least, every, push),
         Reading("external_force", least, every, push, changes=True),
@@ -325,37 +325,61 @@ def _changing(
     error = float(np.sqrt(np.max(squares[driven] / sample.torque[driven], initial=0.0)))
     count = min(_SPLINES, sample.rows // (_BLOCKS * decisions.SHORTEST))
     rows = count * _BLOCKS * decisions.SHORTEST
-    if n <= 3 or error < decisions.DIFFERS or count < decisions.SCATTERED:
+    if n <= 3 or error < decisions.AGREES or count < decisions.SCATTERED:
         return
     folded, order = sample.in_blocks(rows, decisions.SHORTEST)
     knots = np.pad(np.linspace(0.0, rows, count - 1), 2, "edge")
     B = BSpline.design_matrix(order, knots, 2).toarray()  # (rows, count), quadratic
+    last = model.layout.n_inertial - 10  # place of mass and first moments of the last body
+    load = np.concatenate([regressor(model, m)[..., last : last + 4] for m in sample.at])
+    starts = np.arange(1, decisions.SEGMENTS) * rows // decisions.SEGMENTS
+    since = {k: load[order] * (order >= k)[:, None, None] for k in starts.tolist()}
+    trials, steps = Trials.of(folded, since)
+    step = next(trials.accepted(steps, decisions.ALTERATION, lambda k: 0), None)
+    if step is not None and _is_main(step):
+        yield _grasped(sample, step)
+        return
+    if error < decisions.DIFFERS:
+        return
     changing = alterations(model, in_time)
-    # a force explains part of what gravity does: the others are compared if it explains some
-    changing = dict(sorted(changing.items(), key=lambda x: x[0].reading.code))
-    splines: dict[tuple[_Alteration, bool], Array] = {}
-    for one, Z in changing.items():
-        splines[one, True] = (Z[order, ..., None] * B[:, None, None]).reshape(rows, n, -1)
-        if len(splines) == 1:
-            trial = Trials(folded, splines[one, True]).held_out
-            left = [trial.left(list(range(k))).sum() for k in (0, 3 * count)]
-            if left[1] > (1 - decisions.DIFFERS) * left[0]:
-                return
+    splines = {
+        (one, True): (Z[order, ..., None] * B[:, None, None]).reshape(rows, n, -1)
+        for one, Z in changing.items()
+    }
+    before = (1 - decisions.DIFFERS) * _left(folded, np.empty((rows, n, 0)))
+    if all(_left(folded, Z) > before for Z in splines.values()):
+        return
     plain = {(one, False): Z[order] for one, Z in {**changing, **constant}.items()}
     trials, offered = Trials.of(folded, splines | plain)
     best = next(trials.accepted(offered, decisions.ALTERATION, lambda x: len(offered[x])), None)
-    if best is None or not best.option[1] or best.p_value > decisions.P_VALUE:
+    if best is None or not best.option[1] or not _is_main(best):
         return
     reading, share = best.option[0].reading, 100 * best.share
     x = B @ best.theta.reshape(-1, count).T  # (rows, 3)
     mean, variance = float(np.linalg.norm(x.mean(axis=0))), np.trace(best.covariance)
     size = float(np.linalg.norm(np.std(x, axis=0)))
-    if share >= decisions.MAIN and size >= max(reading.least, mean):
+    if size >= max(reading.least, mean):
         yield finding(
             reading.code, subject="all joints", severity="error", what="changes", cure="changes",
             explained=False, size=size, std_error=np.sqrt(variance / count), share_pct=share,
             angle=np.degrees(np.arctan(size)), error_pct=100 * error,
         )  # fmt: skip
+
+
+def _is_main(accepted: Accepted[Option]) -> bool:
+    """Return whether an option explains most of the residual, significantly."""
+    return 100 * accepted.share >= decisions.MAIN and accepted.p_value <= decisions.P_VALUE
+
+
+def _grasped(sample: Sample, step: Accepted[int]) -> Finding:
+    """Return the finding of a load that the last link carries from a sample on."""
+    t = np.concatenate([motion.t for motion in sample.at])
+    names = np.repeat([x.log.name for x in sample.recordings], [len(m.t) for m in sample.at])
+    mass, error = float(step.theta[0]), float(np.sqrt(step.covariance[0, 0]))
+    return finding(
+        "payload_step", subject="all joints", sense=mass > 0, mass=mass, std_error=error,
+        name=str(names[step.option]), start=t[step.option], share_pct=100 * step.share,
+    )  # fmt: skip
 
 
 def _accepted(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
@@ -15,7 +15,7 @@ from robotid.base.findings import Finding, listed, toml_key
 from robotid.base.typing import Array
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis import decisions
-from robotid.diagnosis.catalogue import codes_with, finding, is_cause
+from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.residual.term_trials import Sample, Trials
 from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.estimation.fitting.fitted import Fit
@@ -295,9 +295,7 @@ def with_entries(fit: Fit, joint: str, entries: Sequence[str | DriveTerm]) -> st
     return drive_line(joint, *stated, *others, *entries)
 
 
-def settled(
-    before: Sequence[Finding], of_fit: Sequence[Finding], ignore: Collection[str] = ()
-) -> list[Finding]:
+def settled(before: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Finding]:
     """Return the findings before and of the fit, without hypotheses that a term explains."""
     # The doctor attributes a torque that depends on the position to wrong masses. The term that
     # explains it is then a warning, even if it is small.
@@ -313,24 +311,13 @@ def settled(
                 evidence={**term.evidence, "replaces": float(len(hypotheses))},
             )
         terms.append(term)
-    # torques in another unit bind the bodies to a wrong prior, whose error looks like a term
-    rescaled = {joint for f in rest if f.code == "current_for_torque" for joint in f.joints}
-    delayed = any(f.code == "torque_delay" for f in rest)
-    # a channel that is read wrongly leaves a residual that looks like other causes
-    wrong = set(codes_with("ignorable")).difference(ignore)
-    is_misread = any(f.severity == "error" and f.code in wrong for f in rest)
-    explained = [
-        f for f in terms
-        if (f.code in codes_with("term") and rescaled.issuperset(f.joints))
-        or (f.code == "joint_delay" and delayed)
-        or (is_misread and f.severity == "warning" and is_cause(f.code))
-    ]  # fmt: skip
-    return rest + [f.reworded(severity="note") if f in explained else f for f in terms]
+    return rest + terms
 
 
 def _explains(term: Finding, hypothesis: Finding) -> bool:
     """Return whether a term of the fit explains a hypothesis from before the fit."""
-    if term.evidence.get("share_pct", 0.0) < decisions.MAIN:
+    shares = [term.evidence.get(key, np.inf) for key in ("share_pct", "validation_share_pct")]
+    if "share_pct" not in term.evidence or min(shares) < decisions.MAIN:
         return False
     if hypothesis.code == "unexplained_torque":
         return not term.joints or hypothesis.joints == term.joints

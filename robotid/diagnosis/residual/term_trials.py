@@ -30,6 +30,7 @@ from robotid.data.log import Trajectory
 from robotid.diagnosis import decisions
 from robotid.diagnosis.decisions import Option, Round, Rule, p_value, select
 from robotid.diagnosis.logs.channels import distance
+from robotid.diagnosis.logs.torque_delay import NEAR
 from robotid.dynamics.constraint_rows import without_forces
 from robotid.dynamics.prepared_logs import independent_share
 from robotid.dynamics.torque import trajectory_regressor
@@ -39,10 +40,8 @@ from robotid.estimation.fitting.fitted import Solution
 from robotid.robot.model import RobotModel
 
 RIDGE = 1e-4  # Smallest share of a column that the regressor must not explain
-_ROWS = 3000  # samples of all fitted logs together, and of all validation logs
-_NUMBERS = 2**24  # elements of their regressor
+_NUMBERS = 2**24  # elements of the regressor of all fitted logs together, and of validation logs
 _PER_INDEPENDENT = 2.0  # samples per independent one behind the filter
-_NEAR = 0.5  # periods of the filter's cut-off
 _FREE = 1e3  # prior spread of an added column, in residuals
 
 
@@ -190,7 +189,7 @@ def take_sample(fit: Solution, *, for_drives: bool = False, is_free: bool = Fals
     if number < decisions.FEWEST:
         return None
     motion = [e.recording.trajectory.at(k) for e, k in parts]
-    Y = np.concatenate([_regressor(model, e.recording.trajectory, k) for e, k in parts])
+    Y = np.concatenate([regressor(model, e.recording.trajectory, k) for e, k in parts])
     tau = np.concatenate([m.tau for m in motion])
     size, first = model.layout.n_inertial, model.n_rows - len(model.joints)
     load = Y[:, first:, :size] @ fit.standard[:size]
@@ -252,7 +251,7 @@ def _free(sample: Sample, X: Array) -> Sample:
 
 def along(sample: Sample, model: RobotModel, at: Sequence[Trajectory], tau: Array) -> Sample:
     """Return the same samples for another robot, or with changed positions."""
-    Y = np.concatenate([_regressor(model, motion) for motion in at])
+    Y = np.concatenate([regressor(model, motion) for motion in at])
     W = sample.weight[:, :, None] * _in_units(Y, sample.independent, sample.U)
     W = np.concatenate([W, sample.W[:, :, W.shape[2] :]], axis=2)
     r = sample.weight * (np.concatenate([motion.tau for motion in at]) - tau)
@@ -264,7 +263,7 @@ def _spread_rows(
     model: RobotModel, fitted: Sequence[Evaluation], validation: Sequence[Evaluation]
 ) -> tuple[list[Array], float]:
     """Return the samples used of each recording, and the share of them that is independent."""
-    most = min(_ROWS, _NUMBERS // (model.n_rows * len(model.layout.names)))
+    most = min(decisions.ROWS, _NUMBERS // (model.n_rows * len(model.layout.names)))
     rows, shares = [], []
     for evaluations in (fitted, validation):
         least = -(-sum(len(e.recording.trajectory.t) for e in evaluations) // most)
@@ -287,7 +286,7 @@ def cut_segments(sizes: Sequence[int], independent: float) -> tuple[slice, ...]:
     return tuple(slice(*pair) for pair in pairwise(edges))
 
 
-def _regressor(model: RobotModel, motion: Trajectory, samples: Array | None = None) -> Array:
+def regressor(model: RobotModel, motion: Trajectory, samples: Array | None = None) -> Array:
     """Return the regressor of the standard parameters at some samples, shape (N, n, p)."""
     Y = trajectory_regressor(model, motion, samples)
     return Y.reshape(-1, model.n_rows, Y.shape[1])
@@ -331,7 +330,7 @@ def _is_steady(recording: Recording) -> Array:
     if signals.cutoff is None:
         return np.ones(motion.v.shape, dtype=bool)
     slow = (np.abs(motion.v) < signals.min_velocity) | (travelled(motion) == 0.0)
-    t, near = motion.t, _NEAR / signals.cutoff
+    t, near = motion.t, NEAR / signals.cutoff
     return np.column_stack([distance(t, t[at]) > near for at in slow.T])
 
 

@@ -126,16 +126,6 @@ def rounded_angles(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]
         )  # fmt: skip
 
 
-def weak_parameters(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
-    """Yield a warning if parameters are at the limit between identifiable and unidentifiable."""
-    if weak := _between(mapping):
-        file = Path(model.tree.path).name
-        yield finding(
-            "weak_parameters", subject=f"file {file}", file=file, faint=weak, base=len(mapping.K),
-            joints=len(model.joints),
-        )  # fmt: skip
-
-
 def _between(mapping: BaseMapping) -> int:
     """Return the number of pivots that are neither rounding errors nor large enough."""
     return int(np.sum(mapping.pivots > REMAINDER)) - len(mapping.K)

@@ -19,7 +19,6 @@ from robotid.diagnosis.urdf.inertials import (
     impossible_inertial,
     negative_masses,
     rounded_angles,
-    weak_parameters,
 )
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.factors import triangle_of
@@ -113,10 +112,7 @@ def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
     findings += [
         x for x in audit_links(model) if x.code != "default_inertial" or x.where not in named
     ]
-    rounded = list(rounded_angles(model, full))
-    findings += rounded
-    if not any(one.evidence["felt"] for one in rounded):
-        findings += weak_parameters(model, full)
+    findings += rounded_angles(model, full)
     structure = Structure(
         model.layout.n_inertial, len(inertial.K), len(full.K), len(full.K),
         _condition(model, full), inertial.unidentifiable,

@@ -17,7 +17,6 @@ HEADERS = ("part", "parameter", "urdf", "value", "std_error", "low", "high", "so
 _NUMBERS = HEADERS[2:7]
 #: Mass [kg], centre of mass [m], inertia about it [kg m^2], in the axes of the joint frame.
 CENTRAL_TERMS = ("m", "cx", "cy", "cz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
-_PAIRS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))  # axes of Pinocchio's six inertias
 _PINOCCHIO = ("m", "cx", "cy", "cz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 _ORDER = [_PINOCCHIO.index(term) for term in CENTRAL_TERMS]
 
@@ -125,7 +124,7 @@ def _central(pi: Array) -> tuple[Array, Array]:
     c, values = pi[1:4] / m, np.array(pi)
     G[1:4, 0], G[1:4, 1:4] = -c / m, np.eye(3) / m
     steiner = c @ c * np.eye(3) - np.outer(c, c)  # (3, 3) [m^2]
-    for row, (i, j) in enumerate(_PAIRS, 4):
+    for row, (i, j) in enumerate(zip(*np.tril_indices(3), strict=True), 4):
         values[row] -= m * steiner[i, j]
         G[row, 0] = steiner[i, j]
         for k in range(3):

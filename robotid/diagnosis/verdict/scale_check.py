@@ -17,13 +17,12 @@ from robotid.diagnosis.catalogue import sentence_of
 from robotid.diagnosis.decisions import AGREES, BETTER, BEYOND_NOISE, DIFFERS, ZERO
 from robotid.dynamics.constraint_rows import loop_basis, without_forces
 from robotid.dynamics.torque import joint_torque_regressor, predict
-from robotid.estimation.fitting.fitted import Fit
+from robotid.estimation.fitting.fitted import CLEARLY, Fit
 from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.prior import assumed_masses
 
 _POSES = 300  # at which gravity is compared
-_HELD_BACK = 1.5  # residual over that of WLS beyond which the prior determines the result
 _ANOTHER = 0.25  # difference of gravity and total mass from which on they contradict the scale
 _TOTAL = "total mass"
 
@@ -330,7 +329,7 @@ def check_scale(fit: Fit) -> ScaleCheck:
     before, after = (float(pi[:size:10].sum()) for pi in (fit.prior, fit.standard))
     errors = [fit.metrics(name).per_joint for name in ("estimate", "wls")]
     follows = all(
-        errors[0][j].rmse <= _HELD_BACK * free.rmse or j in fit.overfitted
+        errors[0][j].rmse <= CLEARLY * free.rmse or j in fit.overfitted
         for j, free in errors[1].items()
     )
     plain = ScaleCheck(

@@ -485,17 +485,14 @@ def rejected(
     for one in findings:
         joints = [joint for joint in one.joints if joint in errors] or [*errors]
         worst = max((errors[joint] for joint in joints), default=np.inf)
-        is_rejected = one.code in _HYPOTHESES and worst < SMALL
-        if one.where == "all joints":
-            is_rejected = False  # it was found in the residual of the prediction
-        elif one.code == "current_for_torque":
-            ratios = [scale_check.gravity[j] for j in joints if j in scale_check.gravity]
-            is_rejected &= all(1 / _MUCH < ratio < _MUCH for ratio in ratios)
-        elif one.code == "gravity_compensated":
-            is_rejected &= scale_check.scale is not None and 1 / _MUCH < scale_check.factor < _MUCH
-        elif one.severity == "error":
-            is_rejected = False
-        if is_rejected:
+        gravity, total = scale_check.gravity, scale_check.factor
+        ratios = {
+            "current_for_torque": [gravity[joint] for joint in joints if joint in gravity],
+            "gravity_compensated": [np.inf if scale_check.scale is None else total],
+        }.get(one.code, [np.inf] if one.severity == "error" else [])
+        is_near = all(1 / _MUCH < ratio < _MUCH for ratio in ratios)
+        # one of all joints was found in the residual of the prediction
+        if one.code in _HYPOTHESES and one.where != "all joints" and worst < SMALL and is_near:
             logs = logs_that_test(validation)
             but = f"; rejected: torque error on {logs} at most {worst:.1f} %"
             one = one.reworded(severity="note", remedy=one.remedy + but)

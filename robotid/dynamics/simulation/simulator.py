@@ -26,7 +26,7 @@ from robotid.dynamics.simulation.simulation_settings import (
 )
 from robotid.dynamics.torque import predict, remember
 from robotid.robot.bodies import link_transfer
-from robotid.robot.drive_term import DriveTerm, MemorylessTerm
+from robotid.robot.drive_term import DIRECTED, LOADED, PLAIN, MemorylessTerm
 from robotid.robot.drives import Bristles, Lag
 from robotid.robot.mass_matrix import drive_inertia, rigid_mass_matrices
 from robotid.robot.model import RobotModel
@@ -229,14 +229,15 @@ class _Group:
     drives: Array | slice  # their indices
     theta: Array  # its parameters, shape (k,)
     states: slice  # their bristle states; empty without any
+    kind: int  # PLAIN, DIRECTED or LOADED: its place in ``Friction``
 
 
 @dataclass(frozen=True)
 class Friction:
     """Friction torque of drives, ``(along + loaded |load|) sign(w) + rest``, all of shape (d,)."""
 
-    along: Array
     rest: Array
+    along: Array
     loaded: Array
 
 
@@ -257,9 +258,9 @@ class RobotPlant:
         self.armature = drive_inertia(model.layout, pi)  # (n, n)
         self.ratios = model.layout.drive_ratios  # (d, n)
         self._share = self.ratios / np.sum(self.ratios**2, axis=1, keepdims=True).clip(min=1e-300)
-        self._groups = _grouped(model, pi)
+        self._groups, self._constant = _grouped(model, pi)
         self.n_states = sum(g.states.stop - g.states.start for g in self._groups)
-        self.is_loaded = any(_is_loaded(g.term) for g in self._groups)
+        self.is_loaded = any(group.kind == LOADED for group in self._groups)
         G, A, engine = model.velocity_map, self.armature, model.pin_model
         # Pinocchio's own joints, each with its own rotor: its ABA is sufficient
         has_own_rotors = np.array_equal(A, np.diag(A.diagonal()))
@@ -285,19 +286,16 @@ class RobotPlant:
     def friction(self, q: Array, v: Array, z: Array | None = None) -> Friction:
         """Return the friction of the drives, without inertia and the sign of the speed."""
         angle, w = self.ratios @ q, self.ratios @ v
-        along, rest, loaded = np.zeros((3, len(w)))
+        parts = self._constant.copy()
         for group in self._groups:
             term, drives, theta = group.term, group.drives, group.theta
-            if isinstance(term, Bristles):
-                if z is not None:
-                    rest[drives] += theta * z[group.states]
-                    continue
-                torque = theta * term.level(w[drives])
+            if not isinstance(term, Bristles):
+                parts[group.kind, drives] += theta * term.amplitude(angle[drives], w[drives])
+            elif z is None:
+                parts[group.kind, drives] += theta * term.level(w[drives])
             else:
-                torque = theta * term.amplitude(angle[drives], w[drives])
-            part = loaded if _is_loaded(term) else along if term.follows_direction else rest
-            part[drives] += torque
-        return Friction(along, rest, loaded)
+                parts[PLAIN, drives] += theta * z[group.states]
+        return Friction(*parts)
 
     def friction_torque(self, F: Friction, v: Array, load: Array) -> Array:
         """Return the friction torque of the drives under a load (n,), shape (n,) [N m or N]."""
@@ -372,25 +370,25 @@ class RobotPlant:
         return np.asarray(self.model.configurations(q[None])[0])
 
 
-def _grouped(model: RobotModel, pi: Array) -> tuple[_Group, ...]:
-    """Return the friction terms of the drives, without inertia and terms of the measurement."""
+def _grouped(model: RobotModel, pi: Array) -> tuple[list[_Group], Array]:
+    """Return the friction terms of the drives that vary, and ``Friction`` (3, d) of the others."""
     layout, theta = model.layout, pi[model.layout.n_inertial :]
     terms: dict[Bristles | MemorylessTerm, list[int]] = {}
     for k, (_, term) in enumerate(layout.drive_parameters):
         if theta[k] != 0.0 and isinstance(term, Bristles | MemorylessTerm):
             terms.setdefault(term, []).append(k)
-    groups, states = [], 0
+    groups, constant, states = [], np.zeros((3, len(layout.drives))), 0
     for term, numbers in terms.items():
         drives = [layout.drive_parameters[k][0] for k in numbers]
         is_all = drives == list(range(len(layout.drives)))
         first, states = states, states + len(numbers) * isinstance(term, Bristles)
         chosen = slice(None) if is_all else np.array(drives)
-        groups.append(_Group(term, chosen, theta[numbers], slice(first, states)))
-    return tuple(groups)
-
-
-def _is_loaded(term: DriveTerm) -> bool:
-    return isinstance(term, MemorylessTerm) and term.is_loaded
+        kind = term.kind if isinstance(term, MemorylessTerm) else DIRECTED
+        if isinstance(term, MemorylessTerm) and term.affine in (0, 2):
+            constant[kind, chosen] += theta[numbers]
+        else:
+            groups.append(_Group(term, chosen, theta[numbers], slice(first, states), kind))
+    return groups, constant
 
 
 class _Loop:

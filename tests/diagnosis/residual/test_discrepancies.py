@@ -3,6 +3,7 @@
 import sys
 import xml.etree.ElementTree as ET
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -292,6 +293,25 @@ def test_a_force_or_gravity_that_changes_in_time_is_the_only_finding(model, forc
     guesses = [Finding(x, "warning", "a.csv", "") for x in ("gravity", "unexplained_torque")]
     (merged,) = settled(guesses, [first])
     assert (merged.severity, merged.evidence["replaces"]) == ("error", 2.0)
+
+
+def grasped(log, model):
+    """Return a log of which the last link carries 1.2 kg, 0.1 m from its joint, from 9.5 s on."""
+    engines = model.pin_model, model.pin_model.copy()
+    engines[1].inertias[6] += pin.Inertia(1.2, np.array([0.0, 0.0, 0.1]), 1e-3 * np.eye(3))
+    tau, a = log.tau.copy(), np.gradient(log.v, log.t, axis=0)
+    for k in np.flatnonzero(log.t > 9.5):
+        before, after = (pin.rnea(x, x.createData(), log.q[k], log.v[k], a[k]) for x in engines)
+        tau[k] += after - before
+    return replace(log, tau=tau)
+
+
+def test_a_load_that_is_grasped_during_the_recording_is_named_with_mass_and_time(model):
+    (first,) = found(model, partial(grasped, model=model), estimator=SETTINGS)
+    assert (first.code, first.severity) == ("payload_step", "warning")
+    assert first.evidence["mass"] == pytest.approx(1.2, rel=0.1)
+    assert first.evidence["start"] == pytest.approx(9.5, abs=0.6)
+    assert "more from t = 9" in first.message
 
 
 @pytest.mark.parametrize(("faster", "noise"), [(1.1, 0.1), (1.03, 0.03)])

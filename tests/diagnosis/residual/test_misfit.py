@@ -18,6 +18,7 @@ from robotid.cli.doctor import doctor
 from robotid.cli.identify import identify
 from robotid.cli.job import job_from_settings, read_job
 from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.explanations import explained
 from robotid.diagnosis.residual import misfit
 from robotid.diagnosis.residual.misfit import couplings as couplings_of
 from robotid.diagnosis.residual.misfit import (
@@ -250,8 +251,8 @@ def test_a_term_stands_for_what_the_doctor_guessed_of_its_torque(three):
         Finding("clipped", "warning", f"run.csv: {LIFT}", ""),
     ]
 
-    def said(code, share):
-        figures = {"share_pct": share, "error_pct": 1.0}
+    def said(code, share, **others):
+        figures = {"share_pct": share, "error_pct": 1.0, **others}
         term = Finding(code, "note", LIFT, "It is.", figures, joints=(LIFT,))
         *kept, term = settled(guesses, [term])
         return [guesses.index(f) for f in kept], term
@@ -263,25 +264,47 @@ def test_a_term_stands_for_what_the_doctor_guessed_of_its_torque(three):
     assert [doubt.joint for doubt in warnings_of([term], three.joints)] == [LIFT]
     assert said("position_offset", 90.0)[0] == [2, 3]
     assert said("load_friction", 90.0)[0] == [0, 2, 3]
+    assert said("spring", 90.0, validation_share_pct=8.0)[0] == [0, 1, 2, 3]
     assert said("spring", 40.0) == ([0, 1, 2, 3], Finding(
         "spring", "note", LIFT, "It is.", {"share_pct": 40.0, "error_pct": 1.0}, joints=(LIFT,)
     ))  # fmt: skip
 
 
-def test_a_term_of_a_torque_in_another_unit_is_a_note():
-    unit = Finding("current_for_torque", "warning", f"run.csv: {PAN}", "", joints=(PAN,))
-    terms = [Finding("coupling", "warning", x, "It is.", joints=(x,)) for x in (PAN, LIFT)]
-    assert [f.severity for f in settled([unit], terms)] == ["warning", "note", "warning"]
-    # a torque of the wrong sign leaves a residual that looks like any of them
-    sign = Finding("torque_sign", "error", "run.csv: boom", "", joints=("boom",))
-    for ignore, severity in (((), "note"), (("torque_sign",), "warning")):
-        assert {f.severity for f in settled([sign], terms, ignore)[1:]} == {severity}
-    assert settled([], terms) == terms
-    late = (
-        Finding("torque_delay", "warning", "run.csv", ""),
-        Finding("joint_delay", "warning", PAN, ""),
+def test_a_finding_of_the_fit_is_a_note_while_a_reading_of_its_joints_stands():
+    # the first two joints carry a common body, the last one is of another arm
+    support = np.repeat([[True, True, False], [False, True, False], [False, False, True]], 10, 1)
+    robot = SimpleNamespace(
+        joints=(PAN, LIFT, "other"), support=support, layout=SimpleNamespace(n_inertial=30)
     )
-    assert [f.severity for f in settled(late[:1], late[1:])] == ["warning", "note"]
+
+    def doctor_finding(code, joint="", severity="error", log="a.csv"):
+        return Finding(code, severity, "", "It is.", log=log, joints=(joint,) if joint else ())
+
+    def fit_finding(code, joint):
+        return doctor_finding(code, joint, "warning", "")
+
+    terms = [fit_finding("coupling", joint) for joint in robot.joints]
+
+    def said(*findings, ignore=()):
+        severities = [one.severity for one in explained(findings, robot, ignore)]
+        return "".join("-" if x == "note" else x[0] for x in severities)
+
+    assert said(*terms) == "www"
+    for code in ("current_for_torque", "torque_sign", "drive_off", "position_sign"):
+        assert said(doctor_finding(code, PAN), *terms) == "e--w"
+    assert said(doctor_finding("torque_sign", PAN), *terms, ignore=("torque_sign",)) == "ewww"
+    assert said(doctor_finding("torque_delay", "", "warning"), *terms) == "w---"
+    # what names no cause explains nothing, and a finding of a validation log rests on the fit
+    gain = doctor_finding("gain_change", LIFT, "warning", "b.csv")
+    assert said(doctor_finding("unexplained_torque", PAN, "warning"), terms[0], gain) == "ww-"
+    assert said(doctor_finding("urdf_mismatch"), doctor_finding("joint_axis", PAN)) == "e"
+    # of one channel: the columns are exchanged, or it has another unit and its sign is no evidence
+    order, far = doctor_finding("torque_order", PAN), doctor_finding("beyond_effort", PAN)
+    sign = doctor_finding("torque_sign", PAN)
+    kept = [explained([far, other], robot) for other in (order, sign)]
+    assert (kept, said(order, sign)) == ([[order], [far]], "ee")
+    for other in (replace(sign, joints=(LIFT,)), replace(sign, log="b.csv")):
+        assert said(far, other) == "ee"
 
 
 def test_a_log_too_short_to_judge_by_is_not_judged(three):

@@ -40,31 +40,29 @@ def drawn(rng, unit, between, *, rows=12):
     return Runs(np.array(H), np.array(h), np.asarray(unit), np.array([0.2, 0.5]))
 
 
-def dense(x, error, unit, new=0.0):
+def dense(x, error, unit):
     """Return the posterior by covariance matrices of all runs, at each spread of runs and units.
 
     Weight, mean of mu, its variance, expected x and their variances (k,), variances of the spread.
     """
     several = max(unit) > 0
-    within = (0.3 * np.exp(Z[::2])) ** 2 if several else [0.0]
-    log, parts = [], []
-    for d_run in within:
-        for d_unit in (0.3 * np.exp(Z)) ** 2:
-            shared = np.equal.outer(unit, unit) if several else np.eye(len(x))
-            G = d_run * np.eye(len(x)) + d_unit * shared
-            W = np.linalg.inv(G + np.diag(error**2))
-            one = np.ones(len(x))
-            P = one @ W @ one + (100 * 0.3) ** -2.0
-            mean = one @ W @ x / P
-            size = np.linalg.slogdet(W)[1] - np.log(P) - x @ W @ x + P * mean**2
-            s = np.sqrt([d_unit, *([d_run] if several else [])]) / 0.3
-            log.append(0.5 * size + np.log(s * scipy.stats.t(4).pdf(s)).sum())
-            left = one - G @ W @ one
-            values = mean + G @ W @ (x - mean)
-            errors = np.diag(G - G @ W @ G) + left**2 / P
-            parts.append((mean, 1 / P, values, errors, d_run, d_unit))
-    weight = np.exp(np.array(log) - max(log))
-    return weight / weight.sum(), *map(np.array, zip(*parts, strict=True))
+    within = (0.3 * np.exp(Z[::2])) ** 2 if several else np.zeros(1)
+    grid = np.meshgrid(within, (0.3 * np.exp(Z)) ** 2, indexing="ij")
+    d_run, d_unit = (variance.ravel() for variance in grid)
+    eye = np.eye(len(x))
+    shared = np.equal.outer(unit, unit) if several else eye
+    G = d_run[:, None, None] * eye + d_unit[:, None, None] * shared
+    W = np.linalg.inv(G + np.diag(error**2))
+    P = W.sum(axis=(1, 2)) + (100 * 0.3) ** -2.0
+    mean = W.sum(axis=1) @ x / P
+    size = np.linalg.slogdet(W)[1] - np.log(P) - W @ x @ x + P * mean**2
+    s = np.sqrt([d_unit, *([d_run] if several else [])]) / 0.3
+    log = 0.5 * size + np.log(s * scipy.stats.t(4).pdf(s)).sum(axis=0)
+    left = 1 - (G @ W).sum(axis=2)
+    values = mean[:, None] + np.einsum("gij,gj->gi", G @ W, x - mean[:, None])
+    errors = np.diagonal(G - G @ W @ G, axis1=1, axis2=2) + left**2 / P[:, None]
+    weight = np.exp(log - max(log))
+    return weight / weight.sum(), mean, 1 / P, values, errors, d_run, d_unit
 
 
 @pytest.mark.parametrize("unit", [(0, 0, 0, 0, 0), (0, 0, 1, 1, 1, 2, 2, 3)])

@@ -85,13 +85,8 @@ def test_a_drive_that_saturates_while_it_follows_has_its_limit_and_gain_found():
     found = identify_loops(robot.model, [log], [log], LoopSettings(), SETTINGS, chooses=False)
     values = dict(zip(found.fit.estimate.names, found.fit.estimate.theta, strict=True))
     hip = robot.model.joints[0]
-    for key, truth in {
-        "kp": 14.0,
-        "kd": 0.3,
-        "limit": 1.2,
-        "viscous": 0.5,
-        "armature": 0.03,
-    }.items():
+    true = {"kp": 14.0, "kd": 0.3, "limit": 1.2, "viscous": 0.5, "armature": 0.03}
+    for key, truth in true.items():
         assert values[f"{hip}.{key}"] == pytest.approx(truth, rel=0.03), key
     said = next(f for f in found.findings if f.code == "limit")
     assert (said.where, said.severity) == (hip, "warning")
