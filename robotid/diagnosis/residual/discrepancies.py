@@ -33,7 +33,6 @@ from robotid.dynamics.torque import (
     inverse_dynamics,
     is_loaded,
     torque_rate,
-    trajectory_regressor,
 )
 from robotid.estimation.fitting.fitted import Fit
 from robotid.robot.model import GRAVITY, RobotModel
@@ -228,19 +227,22 @@ def explain_residual(
         return (), ()
     table = readings(model, fit.standard, sample)
     possible = alterations(model, [reading for reading in table if not reading.changes])
-    changing = tuple(_changing(model, sample, [x for x in table if x.changes], possible))
-    if changing:  # it imitates all other readings and terms
-        return (), changing
     misfits, explained = find_misfits(sample), sample
     altered_by = list(_accepted(model, sample, possible))
     if altered_by:
         altered = np.concatenate([possible[alteration] for alteration, *_ in altered_by], axis=2)
         explained = altered_by[0][2].with_columns(altered)
     unlike = unlike_log(sample) if is_one_robot else None
-    if unlike is not None and unlike_log(explained) is not None:  # no reading of all logs does
-        sample, between = _between_logs(model, sample, unlike)
-        misfits, others = explain_residual(fit, sample, is_one_robot=False)
-        return misfits, (*between, *others)
+    if unlike is not None:
+        # it is only compared if no term or reading of all logs explains its residual
+        every = explained.with_columns(_columns(misfits, sample)) if misfits else explained
+        if unlike_log(every) is not None:
+            sample, between = _between_logs(model, sample, unlike)
+            misfits, others = explain_residual(fit, sample, is_one_robot=False)
+            return misfits, (*between, *others)
+    changing = tuple(_changing(model, sample, [x for x in table if x.changes], possible))
+    if changing:  # it imitates all other readings and terms
+        return (), changing
     if misfits and altered_by:
         lacking = _columns(misfits, sample)
         if _left(sample, altered) < _left(sample, lacking):
@@ -258,7 +260,7 @@ def _between_logs(
 ) -> tuple[Sample, list[Finding]]:
     """Return samples with columns for what is different in one log, and its finding."""
     own, rows = others.left_out(sample)
-    possible = alterations(model, [*_of_log(model, own)])
+    possible = alterations(model, [*_of_log(model, own, others)])
     before = float(Trials(own, np.empty((*own.r.shape, 0))).held_out.left([]).sum())
     noise = own.share * np.count_nonzero(own.weight)
     for alteration, difference, _ in _accepted(model, own, possible, own.recordings[0].log.name):
@@ -271,7 +273,7 @@ def _between_logs(
     return sample, []
 
 
-def _of_log(model: RobotModel, sample: Sample) -> Iterator[Reading]:
+def _of_log(model: RobotModel, sample: Sample, others: OtherLogs) -> Iterator[Reading]:
     """Yield the readings of one log that differs from others: of its channels, a load, a robot."""
     for reading in readings(model, sample.standard, sample):
         if reading.code in ("position_offset", "torque_scale", "joint_delay", "gravity"):
@@ -282,11 +284,12 @@ def _of_log(model: RobotModel, sample: Sample) -> Iterator[Reading]:
     inertial = _torques(model, pi, at) - friction - _torques(model, _bodies(model, pi), _still(at))
     yield Reading("time_scale", 0.04, [()], lambda on: inertial[..., None])
     last = slice(model.layout.n_inertial - 10, model.layout.n_inertial)
-    load = np.concatenate([trajectory_regressor(model, motion)[:, last] for motion in at])
+    load = np.concatenate([regressor(model, motion)[..., last] for motion in at])
     weight = sample.weight[..., None]
     robot = sample.W[..., : len(sample.U)] / np.where(weight > 0.0, weight, np.inf)
-    yield Reading("payload", 0.0, [()], lambda on: load.reshape(*sample.r.shape, 10))
-    yield Reading("robot", 0.0, [()], lambda on: robot)
+    yield Reading("payload", 0.0, [()], lambda on: load)
+    if others.is_out.count(False) > 1:  # they agree: it is no error of the model
+        yield Reading("robot", 0.0, [()], lambda on: robot)
 
 
 def _columns(misfits: Sequence[Misfit], sample: Sample) -> Array:

@@ -19,72 +19,60 @@ from robotid.estimation.work_plan import WorkPlan
 from robotid.identification.pipeline import in_memory, with_drives
 from robotid.robot.drives import wanted_families
 
-
-@pytest.fixture(scope="module")
-def model():
-    return robot("ur5")
+MODEL = robot("ur5")
+PI = another_robot(MODEL, np.random.default_rng(0))
 
 
 @pytest.fixture(scope="module")
-def pi(model):
-    return another_robot(model, np.random.default_rng(0))
-
-
-@pytest.fixture(scope="module")
-def logs(model, pi):
-    every = (clean_log(model, seed, pi=pi, rate=50.0, duration=10.0) for seed in range(3))
+def logs():
+    every = (clean_log(MODEL, seed, pi=PI, rate=50.0, duration=10.0) for seed in range(3))
     return [replace(log, path=f"run{k}.csv") for k, log in enumerate(every)]
 
 
-def delayed(log):
-    late = [np.interp(log.t - 0.03, log.t, tau) for tau in log.tau.T]
-    return replace(log, tau=np.column_stack(late))
-
-
-def with_load(model, pi, mass):
+def with_load(mass, pi=PI):
     loaded = pi.copy()
-    last = loaded[: model.layout.n_inertial].reshape(-1, 10)[-1]
+    last = loaded[: MODEL.layout.n_inertial].reshape(-1, 10)[-1]
     last += mass * np.array([1, 0, 0.05, 0.1, 0.02, 0, 0.02, 0, 0, 0.02])
-    log = clean_log(model, 2, pi=loaded, rate=50.0, duration=10.0)
+    log = clean_log(MODEL, 2, pi=loaded, rate=50.0, duration=10.0)
     return replace(log, path="run2.csv")
 
 
-def sample_of(model, fitted, validation=()):
-    recordings = in_memory(model, SignalSettings(), fitted, validation)
-    plain = wanted_families("viscous+coulomb", model.joints)
+def sample_of(fitted, validation=()):
+    recordings = in_memory(MODEL, SignalSettings(), fitted, validation)
+    plain = wanted_families("viscous+coulomb", MODEL.joints)
     fit = with_drives(recordings, EstimatorSettings(prior_weight=1.0), plain)
     return fit, take_sample(fit)
 
 
-def differences(model, fitted, validation=()):
-    findings = explain_residual(*sample_of(model, fitted, validation))[1]
+def differences(fitted, validation=()):
+    findings = explain_residual(*sample_of(fitted, validation))[1]
     return [f for f in findings if f.code == "log_differs"]
 
 
-def test_a_load_in_the_validation_log_only_is_weighed(model, pi, logs):
-    assert differences(model, logs[:1], logs[1:2]) == []
-    loaded = with_load(model, pi, 1.0)
-    (change,) = differences(model, logs[:1], [loaded])
+def test_a_load_in_the_validation_log_only_is_weighed(logs):
+    assert differences(logs[:1], logs[1:2]) == []
+    loaded = with_load(1.0)
+    (change,) = differences(logs[:1], [loaded])
     assert (change.where, change.severity) == ("run2.csv", "warning")
     assert change.evidence["size"] == pytest.approx(1.0, rel=0.1)
     assert change.evidence["std_error"] < 0.05
     assert "the last link carries about +0.9" in change.message
-    (change,) = differences(model, [loaded], logs[:1])
+    (change,) = differences([loaded], logs[:1])
     assert change.evidence["size"] == pytest.approx(-1.0, rel=0.1)
     # of three logs the one that contradicts the others, wherever it stands
-    (change,) = differences(model, [with_load(model, pi, 0.5), *logs[:2]])
+    (change,) = differences([with_load(0.5), *logs[:2]])
     assert change.where == "run2.csv"
     assert change.evidence["size"] == pytest.approx(0.5, rel=0.1)
 
 
-def test_a_load_is_named_beside_a_urdf_of_another_robot(model):
+def test_a_load_is_named_beside_a_urdf_of_another_robot():
     """Links that weigh half or twice what the URDF says are no reason to miss a load."""
     rng = np.random.default_rng(4)
-    size, pi = model.layout.n_inertial, another_robot(model, rng)
+    size, pi = MODEL.layout.n_inertial, another_robot(MODEL, rng)
     links = pi[:size].reshape(-1, 10)
     links *= rng.choice([0.5, 2.0], (len(links), 1))
-    fitted = replace(clean_log(model, 5, pi=pi, rate=50.0, duration=10.0), path="run5.csv")
-    (change,) = differences(model, [fitted], [with_load(model, pi, 1.0)])
+    fitted = replace(clean_log(MODEL, 5, pi=pi, rate=50.0, duration=10.0), path="run5.csv")
+    (change,) = differences([fitted], [with_load(1.0, pi)])
     mass, error = change.evidence["size"], change.evidence["std_error"]
     assert mass == pytest.approx(1.0, abs=4 * error)
     assert error < 0.05
@@ -101,21 +89,23 @@ def test_a_load_is_named_beside_a_urdf_of_another_robot(model):
         (lambda log: replace(log, q=log.q + 0.2 * np.eye(6)[2]),
          "run1.csv: elbow_joint", -0.2, "zero position"),
         (lambda log: replace(log, t=1.25 * log.t, v=None), "run1.csv", None, "run 1.2"),
-        (delayed, "run1.csv", 0.03, "of all joints is delayed by"),
+        (lambda log: replace(log, tau=np.transpose(
+            [np.interp(log.t - 0.03, log.t, tau) for tau in log.tau.T])),
+         "run1.csv", 0.03, "of all joints is delayed by"),
     ],
 )  # fmt: skip
-def test_what_differs_in_one_log_is_named_with_its_size(model, logs, change, where, size, words):
-    (found,) = differences(model, [logs[0], change(logs[1])], logs[2:])
+def test_what_differs_in_one_log_is_named_with_its_size(logs, change, where, size, words):
+    (found,) = differences([logs[0], change(logs[1])], logs[2:])
     assert found.where == where
     assert words in found.message
     if size is not None:
         assert found.evidence["size"] == pytest.approx(size, rel=0.06)
 
 
-def test_the_fit_to_the_other_logs_is_the_prior_of_a_log(model, logs):
+def test_the_fit_to_the_other_logs_is_the_prior_of_a_log(logs):
     """What a log changes of it gives the fit to all logs, by matrices of all their rows."""
     gain = np.array([1, 0.8, 1, 1, 1, 1])
-    sample = sample_of(model, [logs[0], replace(logs[1], tau=gain * logs[1].tau)], logs[2:])[1]
+    sample = sample_of([logs[0], replace(logs[1], tau=gain * logs[1].tau)], logs[2:])[1]
     others = unlike_log(sample)
     own = others.left_out(sample)[0]
     assert list(others.is_out) == [False, True, False]
