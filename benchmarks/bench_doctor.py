@@ -44,12 +44,12 @@ DURATIONS = (8.0, 20.0)  # [s] of clean logs
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="one seed")
+    parser.add_argument("--quick", action="store_true", help="one seed, every fifth corruption")
     parser.add_argument("--seeds", type=int, default=8)
     options = parser.parse_args()
     seeds = range(1 if options.quick else options.seeds)
     clean(seeds)
-    spoilt(seeds)
+    spoilt(seeds, dict(itertools.islice(CASES.items(), 0, None, 5 if options.quick else 1)))
     same_motion(seeds)
     payload(seeds)
     commands(seeds)
@@ -74,13 +74,13 @@ def clean(seeds):
         print(f"| {name} | {duration:g} | {len(seeds)} | {dict(found) or 'none'} |")
 
 
-def spoilt(seeds):
+def spoilt(seeds, cases):
     print(f"\ncorrupted logs of a UR5, {len(seeds)} seeds each\n")
     print("| corruption | wanted | found | other findings above a note |\n|---|---|---|---|")
     model = robot("ur5")
     tables = [table_of(clean_log(model, seed)) for seed in seeds]
     hits = 0
-    for name, case in CASES.items():
+    for name, case in cases.items():
         found, other = 0, Counter()
         for table in tables:
             seen = loud(examine_table(case, table))
@@ -89,7 +89,7 @@ def spoilt(seeds):
         hits += found
         side = ", ".join(f"{code} {count}/{len(seeds)}" for code, count in other.most_common())
         print(f"| {name} | {', '.join(case.codes)} | {found}/{len(seeds)} | {side or '-'} |")
-    print(f"\nfound with the right code: {hits} of {len(CASES) * len(seeds)}")
+    print(f"\nfound with the right code: {hits} of {len(cases) * len(seeds)}")
 
 
 def examine_table(case, table):

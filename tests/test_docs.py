@@ -11,7 +11,9 @@ import subprocess
 import sys
 import textwrap
 import tomllib
+from contextlib import nullcontext, redirect_stdout
 from importlib import import_module
+from io import StringIO
 from pathlib import Path
 
 import mujoco
@@ -185,12 +187,30 @@ def follow(tmp_path, monkeypatch, capsys):
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
-    """The folder that ``robotid demo`` writes."""
-    folder = tmp_path_factory.mktemp("demo") / "robotid-demo"
-    with pytest.MonkeyPatch.context() as patched:
+    """The folder that ``robotid demo`` writes, what it prints and the stages that it shows."""
+    folder, printed, stages = tmp_path_factory.mktemp("demo") / "robotid-demo", StringIO(), []
+    shown = nullcontext(lambda *stage: stages.append(stage))
+    with pytest.MonkeyPatch.context() as patched, redirect_stdout(printed):
         leave_out_meshes(patched)
+        patched.setattr("robotid.cli.demo.progress_of", lambda options: shown)
         assert main(["demo", "--out", str(folder)]) == 0
-    return folder
+    return folder, printed.getvalue(), stages
+
+
+def test_demo_runs_from_nothing_and_finds_the_truth(demo):
+    out, printed, stages = demo
+    assert stages, "the stages of the identification are shown"
+    assert "verdict: good" in printed
+    assert "of 58 base parameters lie within 3 standard errors of the truth" in printed
+    count = int(printed.split(" of 58 base")[0].split()[-1])
+    assert count >= 55  # 58 intervals of 99.7 % and a little model error of the friction's edge
+    assert (out / "replay.html").stat().st_size > 100_000
+    links = re.findall(r'<a href="([^"#]+)"', (out / "report.html").read_text(encoding="utf-8"))
+    assert len(set(links)) == 4
+    assert {name for name in links if (out / name).is_file()} == set(links)
+    assert f"written to {out}: report.html, " in " ".join(printed.split())
+    assert len(printed.splitlines()) <= 40, "one screen"
+    assert "payload of known mass" not in printed, "the scale of simulated torques is known"
 
 
 def test_the_first_tutorial_runs_as_written(follow):
@@ -224,18 +244,18 @@ def test_a_payload_of_two_logs(follow):
 
 
 def test_a_table_with_any_column_names_is_imported(follow, demo):
-    Path("robotid-demo").symlink_to(demo)
+    Path("robotid-demo").symlink_to(demo[0])
     printed = follow("how_to/import_table.md")
     assert "verdict: good" in printed
     assert "Identification of z1_description: 58 base parameters" in printed  # of arrays
 
 
 def test_gravity_is_compensated_without_the_offset(follow, demo):
-    Path("robotid-demo").symlink_to(demo)
+    Path("robotid-demo").symlink_to(demo[0])
     numbers = re.findall(r"\[([^]']+)\]", follow("how_to/gravity_compensation.md"))
     holding, gravity, pinocchios = (np.array(line.split(), dtype=float) for line in numbers)
     np.testing.assert_allclose(gravity, pinocchios, atol=1e-9)
-    drives = json.loads(next(demo.glob("*.drive.json")).read_text())["drives"]
+    drives = json.loads(next(demo[0].glob("*.drive.json")).read_text())["drives"]
     offset = [drive["offset"] for drive in drives.values()]
     np.testing.assert_allclose(holding - gravity, offset, atol=1e-6)
 

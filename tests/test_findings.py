@@ -9,15 +9,7 @@ from string import Formatter
 import pytest
 from helpers.paths import ROOT
 
-from robotid.base.findings import (
-    Finding,
-    by_severity,
-    grouped,
-    listed,
-    sentence,
-    tally,
-    toml_key,
-)
+from robotid.base.findings import Finding, by_severity, grouped, listed, sentence, toml_key
 from robotid.base.text import columns, command_lines, in_digits_of, period, tinted, wrapped
 from robotid.diagnosis.catalogue import entries, finding, reason_of, step_of
 
@@ -202,7 +194,6 @@ def test_findings_of_one_code_are_one_cause_and_say_what_they_share_once():
     assert (bent.severity, bent.joints) == ("warning", ("arm_1",))
     assert (old.severity, old.joints, old.messages) == ("note", (), ("the URDF is of 2020",))
     assert (small.code, small.severity) == ("static_joint", "note"), "a cause of its own"
-    assert tally((rest, bent, old, small)) == "1 error, 2 warnings, 2 notes"
     assert grouped([]) == ()
 
 

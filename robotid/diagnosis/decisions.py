@@ -94,6 +94,9 @@ NO_ERROR_OF_MASSES = 3.0
 #: Ratio of the residuals of two explanations below which the first is clearly the better one.
 BETTER = 0.5
 SCATTERED = 3  # Segments from which a scatter is determined
+#: Share of a torque that is noise even in an exact log, and of the largest singular value that
+#: dependent columns leave.
+EXACT = 1e-5
 NOTHING = 1e-300  # A sum of squares that is 0, as a divisor
 Option = TypeVar("Option", bound=Hashable)
 

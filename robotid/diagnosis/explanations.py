@@ -44,10 +44,8 @@ def _explains(cause: Finding, one: Finding, bound: Mapping[str, Array]) -> bool:
     """Return whether a finding explains one of its stage or a later one."""
     before, stage, joints = _stage(cause), _stage(one), [*bound]
     if stage < _UNNAMED:  # it is found of one channel, or with the readings before it applied
-        return (
-            before == stage - 1 and cause.log == one.log
-            and (not cause.joints or set(cause.joints).issuperset(one.joints or joints))
-        )  # fmt: skip
+        is_same = not cause.joints or set(cause.joints) >= set(one.joints) > set()
+        return before == stage - 1 and cause.log == one.log and is_same
     if before in (stage, _UNNAMED):
         return False
     # a fit binds the joints that carry a common body

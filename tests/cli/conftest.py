@@ -15,15 +15,6 @@ def arm():
 
 
 @pytest.fixture(scope="session")
-def upright(tmp_path_factory):
-    """The arm in a vertical plane, where gravity loads both joints."""
-    path = tmp_path_factory.mktemp("upright") / "upright.urdf"
-    text = (URDF / "planar_2r.urdf").read_text()
-    path.write_text(text.replace('rpy="0 0 0"', f'rpy="{np.pi / 2} 0 0"', 1))
-    return RobotModel.from_urdf(path)
-
-
-@pytest.fixture(scope="session")
 def arm_logs(arm, tmp_path_factory):
     """A folder with two motions of an arm that its URDF does not describe."""
     folder, rng = tmp_path_factory.mktemp("arm"), np.random.default_rng(0)

@@ -2,12 +2,10 @@
 
 import json
 import re
-from contextlib import nullcontext
 
 import numpy as np
 import pytest
 from helpers.paths import URDF as PLANAR
-from helpers.replay_data import leave_out_meshes
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
@@ -96,25 +94,3 @@ def test_wrong_use_has_its_exit_code_and_message(arm_logs, tmp_path, capsys, fla
     words = ["identify", ARM, str(arm_logs / "fit.csv"), "--out", str(tmp_path / "out"), *flags]
     assert main(words) == code
     assert message in capsys.readouterr().err
-
-
-def test_demo_runs_from_nothing_and_finds_the_truth(tmp_path, capsys, monkeypatch):
-    out, stages = tmp_path / "demo", []
-    monkeypatch.setattr("robotid.cli.demo._PERIOD", 7.0)
-    leave_out_meshes(monkeypatch)
-    shown = nullcontext(lambda *stage: stages.append(stage))
-    monkeypatch.setattr("robotid.cli.demo.progress_of", lambda options: shown)
-    assert main(["demo", "--out", str(out)]) == 0
-    printed = capsys.readouterr().out
-    assert stages, "the stages of the identification are shown"
-    assert "verdict: good" in printed
-    assert "of 58 base parameters lie within 3 standard errors of the truth" in printed
-    count = int(printed.split(" of 58 base")[0].split()[-1])
-    assert count >= 55  # 58 intervals of 99.7 % and a little model error of the friction's edge
-    assert (out / "replay.html").stat().st_size > 100_000
-    links = re.findall(r'<a href="([^"#]+)"', (out / "report.html").read_text(encoding="utf-8"))
-    assert len(set(links)) == 4
-    assert {name for name in links if (out / name).is_file()} == set(links)
-    assert f"written to {out}: report.html, " in " ".join(printed.split())
-    assert len(printed.splitlines()) <= 40, "one screen"
-    assert "payload of known mass" not in printed, "the scale of simulated torques is known"

@@ -338,14 +338,15 @@ def test_stands_tell_more_of_gravity_than_random_ones(between):
 
 
 def test_limits_are_those_of_the_urdf_and_those_stated(panda):
-    limits = MotionLimits.of_model(panda, share=0.5, jerk=7.0, acceleration={"panda_joint4": 3.0})
+    stated = {"velocity": 0.7, "acceleration": 3.0, "torque": 20.0}  # less than half the URDF's
+    of_joint = {key: {"panda_joint4": value} for key, value in stated.items()}
+    limits = MotionLimits.of_model(panda, share=0.5, jerk=7.0, **of_joint)
     for j, joint in enumerate(panda.limits):
         assert limits.middle[j] == pytest.approx((joint.lower + joint.upper) / 2)
-        half, stated = (joint.upper - joint.lower) / 2, 3.0 if j == 3 else np.inf
-        np.testing.assert_allclose(
-            limits.sizes[:, j],
-            [half / 2, joint.velocity / 2, stated, 7.0, joint.effort / 2, np.inf],
-        )
+        half = (joint.upper - joint.lower) / 2
+        most = joint.velocity / 2, np.inf, joint.effort / 2
+        v, a, torque = stated.values() if j == 3 else most
+        np.testing.assert_allclose(limits.sizes[:, j], [half / 2, v, a, 7.0, torque, np.inf])
     assert abs(limits.middle[3]) > 1.0  # its range is not even
 
 

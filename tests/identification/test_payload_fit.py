@@ -196,6 +196,9 @@ def test_errors_about_the_centre_of_mass_are_those_of_first_order(rng):
         length = errors[:3].max() / 0.05 / factor
         short = payload_of(SimpleNamespace(length=length), "tool", x, C, freedom)
         assert ("com" in short.reasons) == is_open
+        of_mass = np.diag([(factor * MASS / 3.0) ** 2, *np.zeros(9)])  # three standard errors
+        light = payload_of(SimpleNamespace(length=100.0), "tool", x, of_mass, freedom)
+        assert ("com" in light.reasons) == is_open
 
 
 def test_friction_that_grows_with_the_load_is_reckoned_with_the_payload(ur5, rng):
@@ -256,11 +259,11 @@ def test_friction_of_currents_is_chosen_on_the_torques_that_the_gains_make(rng):
 
     gains = np.array([40.0, 3.0, 9.0])
 
-    def current(x, extra=0.0):
-        rigid = (joint_torque_regressor(model, x.q, x.v, x.a) @ pi).reshape(x.tau.shape) + extra
-        return replace(x, tau=(x.tau + 0.08 * np.sign(x.v) * np.abs(rigid)) / gains)
+    def current(x, mu):
+        rigid = (joint_torque_regressor(model, x.q, x.v, x.a) @ pi).reshape(x.tau.shape)
+        return replace(x, tau=(x.tau + mu * np.sign(x.v) * np.abs(rigid)) / gains)
 
-    logs = current(log, load_torque(model, log, "tool0")), current(without)
+    logs = current(log, 0.0), current(without, 0.08)  # it is that of the robot without the load
     asked = {"links": ["tool0"], "masses": {"tool0": MASS}, "unknown_gains": model.joints}
     plain, found = (
         fit(model, logs[:1], logs[1:], signals=EXACT, **asked)

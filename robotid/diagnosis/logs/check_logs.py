@@ -18,7 +18,7 @@ from robotid.data.log import REPEATED, Log, Trajectory, repeated_share
 from robotid.data.signal_settings import LogUnits, SignalSettings
 from robotid.data.units import AT_REST, STILL
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import BETTER, NOTHING, SCATTERED, SEGMENTS, ZERO
+from robotid.diagnosis.decisions import BETTER, NOTHING, ROWS, SCATTERED, SEGMENTS, ZERO
 from robotid.diagnosis.explanations import explained
 from robotid.diagnosis.logs import channels
 from robotid.diagnosis.logs.base_checks import check_base
@@ -34,7 +34,6 @@ from robotid.estimation.estimators import WLS, Estimate, determination
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread, with_assumed_inertials
 
-_ROWS = 5000  # of a log, from which its excitation is computed
 #: Errors of channels after which no model fits the torques.
 _FIT_NO_MODEL = ("time_scale", "unsigned_torque", "constant_torque")
 _FAR = 2 * np.pi  # number in a log above which a position may be a percentage
@@ -175,7 +174,7 @@ def check_excitation(
     signals: SignalSettings, name: str,
 ) -> Iterator[Finding]:  # fmt: skip
     """Yield which base parameters the fitted motions determine."""
-    prior, step = model.standard_parameters(), -(-max(len(m.t) for m in motions) // _ROWS)
+    prior, step = model.standard_parameters(), -(-max(len(m.t) for m in motions) // ROWS)
     thinned = [motion.every(step) for motion in motions]
     try:
         masks = [row_mask(model, m, signals.min_velocity) for m in thinned]

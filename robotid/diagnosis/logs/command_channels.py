@@ -30,7 +30,8 @@ SECONDS = 5.0  # [s] of the averaged spectra, and least total time of constant c
 EXCITED = 1e-4  # least power of a command, over that of its strongest frequency
 _LONGEST = 0.5  # [s] longest delay, or lead, of a position; a joint has settled after it
 _INTERVAL = 0.05  # [s] over which signals are averaged to compare their changes
-_SLOW = 5.0  # [lags] least duration of slow sweeps
+# Share of the rows above half of a speed that are near it, in movements at one speed; a sine: 0.43
+_FLAT = 0.6
 _RESOLVED = 10.0  # least number of encoder steps in a sweep, and of rows per period
 
 
@@ -180,7 +181,7 @@ class _Loop:
         moves = np.flatnonzero(np.diff(self.command) != 0)
         reversals = moves[1:][np.diff(np.sign(np.diff(self.command)[moves])) != 0]
         lag = max(self.lag[0], 0.0) if np.isfinite(self.lag[0]) else 0.0
-        least, delay = max(_SLOW * lag, _LONGEST / 2), round(lag / self.step)  # [s], [samples]
+        least, delay = _LONGEST / 2, round(lag / self.step)  # [s], [samples]
         slow = [(i, k) for i, k in pairwise(reversals.tolist()) if (k - i) * self.step > least]
         swept = np.array([abs(self.command[k] - self.command[i]) for i, k in slow])
         followed = np.array([np.ptp(self.q[i : k + delay + 1]) for i, k in slow])
@@ -285,7 +286,7 @@ def _stopped(log: Log, loop: _Loop) -> Iterator[Finding]:
         at, near = float(np.median(q[beyond])), DIFFERS * float(sent[beyond].std())
         flat = np.mean(np.abs(q[beyond] - at) < near)
         is_far = quantum(loop.q) < near < DIFFERS * np.ptp(q) and sent.max() - at > STILL
-        if flat > MOST and is_far and np.mean(q > at + near) < AGREES:
+        if flat > 1 - BETTER**2 and is_far and np.mean(q > at + near) < AGREES:
             most = sign * float(np.max(sign * loop.command))
             figures = {"at": sign * at, "command": most, "share": share, "movements": visits}
             yield finding("end_stop", log.name, loop.name, side=side, unit=loop.unit, **figures)
@@ -357,7 +358,7 @@ def _saturated(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
         clipped = []
         for start, stop in runs_of(np.abs(v) > 0.5 * top):
             at = np.flatnonzero(np.abs(v[start:stop]) > (1 - DIFFERS) * top) + start
-            if len(at) >= 5 and len(at) >= BETTER * (stop - start):
+            if len(at) >= 5 and len(at) >= _FLAT * (stop - start):
                 unlike = abs(float(np.mean(wanted[at])) / float(np.mean(v[at])) - 1)
                 if unlike > 2 * DIFFERS:
                     clipped.append((len(at) / len(v), float(np.ptp(error[at]))))

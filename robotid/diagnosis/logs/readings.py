@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.diagnosis.decisions import ZERO
+from robotid.diagnosis.decisions import EXACT, ZERO
 from robotid.diagnosis.logs.probe import Probe, drive_columns
 from robotid.dynamics.rows import inertial_rows, joint_constants
 from robotid.robot.model import GRAVITY, RobotModel
@@ -30,7 +30,6 @@ _ALIKE = 1.0  # difference of misfits below which two readings explain a log equ
 EXPLAINED = 0.1  # unexplained share of a torque below which a reading explains it
 _POOR = 0.0005  # unexplained share of a torque from which other readings are tried ...
 _GROSS = 0.05  # ... and from which other directions of the axes are tried
-_FLOOR = 1e-5  # an unexplained share below this is rounding
 _LOOSE = 10.0  # prior deviation of the bodies, in sizes of the URDF's
 _FEW = 24  # instants with which the readings are chosen that are tried with all
 _SEGMENTS = 8  # of the log that are held out in turn
@@ -85,7 +84,7 @@ class _Motion:
             urdf = X @ pi - self.subtracted * (weight @ pi)
         drive = drive_columns(self.model, self.q, self.v, self.a)[:, self.rows]
         level = np.sqrt(np.mean(self.tau**2, axis=0).max())
-        drive *= level / (np.sqrt(np.mean(drive**2, axis=0)) + _FLOOR)
+        drive *= level / (np.sqrt(np.mean(drive**2, axis=0)) + EXACT)
         coupled, drive = drive[..., _DRIVE:], drive[..., :_DRIVE]
         logged = np.repeat(self.tau[:, None], len(self.rows), axis=1)
         bodies = (X * self.spread[self.moved])[..., self.spread[self.moved] > 0.0]
@@ -216,12 +215,12 @@ class Samples:
 def _variation(tau: Array) -> Array:
     """Return the sum of squares of torques (N, n) about their mean, (n,), 0 if constant."""
     squares = np.sum((tau - tau.mean(axis=0)) ** 2, axis=0)
-    return np.where(squares > _FLOOR**2 * np.sum(tau**2, axis=0), squares, 0.0)
+    return np.where(squares > EXACT**2 * np.sum(tau**2, axis=0), squares, 0.0)
 
 
 def misfit(share: Array) -> float:
     """Return the sum of the logarithms of unexplained shares: lower is better."""
-    return float(np.sum(np.log(np.minimum(share, 1.0) + _FLOOR)))
+    return float(np.sum(np.log(np.minimum(share, 1.0) + EXACT)))
 
 
 def _over(left: Array, size: Array) -> Array:
@@ -249,14 +248,14 @@ def _fitted(products: Array, size: Array, count: int) -> Array:
     noise, x = EXPLAINED * size, np.zeros((m, c))
     A, b = np.zeros((p + _DRIVE * m,) * 2), np.zeros(p + _DRIVE * m)
     for _ in range(2):
-        weight = count / np.where(size > 0.0, noise + _FLOOR * size, np.inf)
+        weight = count / np.where(size > 0.0, noise + EXACT * size, np.inf)
         weighted = weight[:, None, None] * products
         A[:p, :p] = weighted[:, :p, :p].sum(axis=0)
         A[own, :p] = weighted[:, p:c, :p]
         A[own[:, :, None], own[:, None]] = weighted[:, p:c, p:c]
         b[:p], b[own] = weighted[:, :p, c].sum(axis=0), weighted[:, p:c, c]
         diagonal = np.diagonal(A).copy()
-        np.fill_diagonal(A, (1.0 + _FLOOR**2) * diagonal + 1.0)
+        np.fill_diagonal(A, (1.0 + EXACT**2) * diagonal + 1.0)
         L = dpotrf(A, lower=True)[0]
         y = dtrtrs(L, b, lower=True)[0]
         d = nnls(L[first:, first:].T, y[first:])[0]
@@ -428,7 +427,7 @@ def _with_sign(samples: Samples, j: int) -> Array:
     own, size = replace(m, rows=np.array([j])), np.abs(m.tau[:, column])
     bodies = own.inertial()[:, 0] @ m.model.standard_parameters()[own.moved]
     X = np.column_stack([bodies, drive_columns(m.model, m.q, m.v, m.a)[:, j]])
-    X /= np.linalg.norm(X, axis=0) + _FLOOR
+    X /= np.linalg.norm(X, axis=0) + EXACT
     tried = []
     for sign in (np.sign(bodies), np.sign(m.v[:, j]), np.sign(m.a[:, j])):
         for _ in range(_TRIED):

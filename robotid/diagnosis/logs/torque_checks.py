@@ -166,8 +166,8 @@ class LoadModel:
     expected: float  # Misfit of torques that fit as well as with separate parameters for each joint
     independent: float  # Number of independent torques
 
-    def misfit(self, scale: float) -> float:
-        """Return the misfit of scaled torques: chi-square, prior included."""
+    def misfit(self, scale: float | Array) -> float:
+        """Return the misfit of torques times a scale, or (n,): chi-square, prior included."""
         R = np.asarray(np.linalg.qr(self._rows(scale), mode="r"))
         return float(R[-1, -1] ** 2)
 
@@ -189,10 +189,11 @@ class LoadModel:
         is_good = chi - self.expected < _WORSE * self.independent
         return is_good and _error_of_links(theta) < _MISMATCH
 
-    def _rows(self, scale: float) -> Array:
+    def _rows(self, scale: float | Array) -> Array:
         """Return the rows of torques and prior, columns times the spread, (N, c+1)."""
         c = len(self.mean)
-        rows = self.R * np.append(self.spread / scale, 1.0)
+        rows = self.R * np.append(self.spread, 1.0)
+        rows[..., :-1] /= np.reshape(scale, (-1, 1, 1))
         prior = np.column_stack([np.eye(c), self.mean / self.spread])
         return np.concatenate([rows.reshape(-1, c + 1), prior])
 
@@ -228,12 +229,11 @@ def _check_loads(probe: Probe, share: Array, name: str, is_explained: bool) -> I
     # torques must be explained by some masses: others are no evidence of them.
     model = load_model(probe, share)
     _, theta, error = model.fit()
-    if model.is_this_robot():
-        yield from _payload(probe, theta[-4:], float(error[-4]), name) if is_explained else ()
-    elif _is_compensated(probe):
+    is_this_robot = model.is_this_robot()
+    if not is_this_robot and _is_compensated(probe):
         yield finding("gravity_compensated", name, what="robot")
     elif is_explained:
-        scale = _torque_scale(model)
+        scale, is_better = (1.0, False) if is_this_robot else _torque_scale(model)
         if scale != 1.0 and model.is_this_robot(scale):
             used = [probe.model.joints[j] for j in np.flatnonzero(model.R.any(axis=(1, 2)))]
             is_all = len(used) == len(share)
@@ -242,10 +242,12 @@ def _check_loads(probe: Probe, share: Array, name: str, is_explained: bool) -> I
                 "current_for_torque", name, () if is_all else used, joints=len(used), also=False,
                 severity="error" if is_unit else "warning", factor=scale, joint=listed(used),
             )  # fmt: skip
-            return
-        factors = dict(zip(probe.model.layout.bodies, theta[:-4].tolist(), strict=True))
-        words = ", ".join(f"{link} {factor:.2g}" for link, factor in factors.items())
-        yield finding("urdf_mismatch", name, factors=words, **factors)
+        elif is_better or _error_of_links(theta) > _MISMATCH:
+            factors = dict(zip(probe.model.layout.bodies, theta[:-4].tolist(), strict=True))
+            words = ", ".join(f"{link} {factor:.2g}" for link, factor in factors.items())
+            yield finding("urdf_mismatch", name, factors=words, **factors)
+        else:
+            yield from _payload(probe, theta[-4:], float(error[-4]), name)
 
 
 def _is_compensated(probe: Probe) -> bool:
@@ -262,11 +264,14 @@ def _error_of_links(theta: Array) -> float:
     return float(np.sum(((theta[:-4] - 1.0) / _SPREAD) ** 2))
 
 
-def _torque_scale(model: LoadModel) -> float:
-    """Return the factor of all torques that no errors of masses explain, 1 without one."""
+def _torque_scale(model: LoadModel) -> tuple[float, bool]:
+    """Return the best factor of all torques beyond errors of masses, and whether one is better."""
+    # It, or the factor of one torque, reduces the misfit significantly.
     far = _SCALES[np.abs(np.log(_SCALES)) > np.log(NO_ERROR_OF_MASSES)]
-    best = float(min(far, key=model.misfit))
-    return best if model.misfit(1.0) - model.misfit(best) > SIGNIFICANT**2 else 1.0
+    common = float(min(far, key=model.misfit))
+    each = np.where(np.eye(len(model.R), dtype=bool)[:, None], _SCALES[:, None], 1.0)
+    least = min(map(model.misfit, (common, *each.reshape(-1, len(model.R)))))
+    return common, model.misfit(1.0) - least > SIGNIFICANT**2
 
 
 def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Finding]:

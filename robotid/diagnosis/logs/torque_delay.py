@@ -17,7 +17,15 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import low_pass
 from robotid.data.units import AT_REST, LARGEST_LAG
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import BEYOND_NOISE, DIFFERS, FEWEST, LEAST_SHARE, ROWS, SEGMENTS
+from robotid.diagnosis.decisions import (
+    BEYOND_NOISE,
+    DIFFERS,
+    EXACT,
+    FEWEST,
+    LEAST_SHARE,
+    ROWS,
+    SEGMENTS,
+)
 from robotid.diagnosis.logs.channels import MOVING, distance
 from robotid.diagnosis.logs.probe import coupled_columns, smooth_motion
 from robotid.dynamics.rows import inertial_rows
@@ -33,11 +41,7 @@ _TIMES = 1.5
 _OF_RATE = 0.15
 _SLOW = 0.05  # [rad/s] slower: a drive may be in stiction, and its friction is unknown around
 NEAR = 0.5  # [periods of the job's filter] time over which it smears stiction
-_SETTLED = 1.5  # [periods of the filter] settling time of the filter at an end of a segment
 _HARMONICS = 4  # of a torque that is periodic in the position, as of gears and magnets
-# Share of a torque that is noise even in an exact log, and of the largest singular value that
-# dependent columns leave.
-_EXACT = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +67,11 @@ class _Misfit:
     def by_load(self) -> float:
         """The share of the unexplained torque that friction by load explains without a delay."""
         now, then = (_at(0.0, x).sum(axis=1) for x in (self.squares, self.loaded))
-        return float((1.0 - (then + _EXACT) / (now + _EXACT)).mean())
+        return float((1.0 - (then + EXACT) / (now + EXACT)).mean())
 
     def delay(self) -> float:
         """Return the delay with the smallest misfit [s], NaN if it is at an end of the grid."""
-        share = self.squares.sum(axis=1) + _EXACT
+        share = self.squares.sum(axis=1) + EXACT
         # relative to the smallest of each joint: a joint that is explained well has more weight
         cost = self.rows @ (share / share.min(axis=1, keepdims=True)) / self.rows.sum()
         best = float(_GRID[np.argmin(cost)])
@@ -87,7 +91,7 @@ class _Misfit:
         blocks = zip(self.delays_without(1), np.swapaxes(self.squares, 0, 1), strict=True)
         then = np.sum([_at(delay, block) for delay, block in blocks], axis=0)
         now = _at(0.0, self.squares).sum(axis=1)
-        return float(1.0 - np.mean((then + _EXACT) / (now + _EXACT)))
+        return float(1.0 - np.mean((then + EXACT) / (now + EXACT)))
 
 
 def _at(delay: float, values: Array) -> Array:
@@ -180,7 +184,7 @@ def _window(
     """Return the filtered columns at every n-th of contiguous rows, without the ends."""
     speeds = motion.v / model.layout.drive_speeds[: len(model.joints)]  # 1 as 1 rad/s
     t, q, v, coarse = motion.t[rows], motion.q[rows], speeds[rows], rows[::every]
-    edge = max(_LONGEST, _SETTLED * period)
+    edge = max(_LONGEST, _TIMES * period)  # the job's filter has settled
     inner = (motion.t[coarse] >= t[0] + edge) & (motion.t[coarse] <= t[-1] - edge)
     # friction as an antisymmetric function of the speed and torques periodic in the position, so
     # that they do not look like a delay; filtered before decimation, because friction jumps
@@ -243,7 +247,7 @@ def _squares(
     blocks = np.array_split(tau, SEGMENTS, axis=1)
     plain = np.array([np.sum(b**2, axis=1) for b in blocks]) / size
     rest = load - Q @ (Q.T @ load)
-    if rest @ rest > _EXACT**2 * load @ load:
+    if rest @ rest > EXACT**2 * load @ load:
         tau -= np.outer(tau @ rest, rest / (rest @ rest))  # of the blocks, too
     return plain, np.array([np.sum(b**2, axis=1) for b in blocks]) / size, used
 
@@ -254,5 +258,5 @@ def _orthonormal(X: Array) -> Array:
     is_excited = length > REMAINDER * length.max()  # other columns are 0 except for rounding
     X = X[:, is_excited] / length[is_excited]
     squares, V = np.linalg.eigh(X.T @ X)
-    independent = squares > _EXACT**2 * squares[-1]
+    independent = squares > EXACT**2 * squares[-1]
     return np.asarray(X @ (V[:, independent] / np.sqrt(squares[independent])))

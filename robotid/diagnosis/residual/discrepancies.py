@@ -143,7 +143,25 @@ def _of_robot(
             "axis_direction:residual", 0.03, one,
             lambda on: by.by_axis[:, :, on > 0].reshape(shape),
         ),
+        Reading(
+            "axis_direction:residual", 0.03, [] if model.layout.prismatic else one,
+            lambda on: _turned_alone(model, by, int(on.argmax())),
+        ),
     )  # fmt: skip
+
+
+def _turned_alone(model: RobotModel, by: TorqueSlopes, j: int) -> Array:
+    """Return the derivative by turning a joint's axis, not what it carries, shape (N, n, 2)."""
+    axes = {joint.name: joint.axis for joint in model.tree.joints}
+    axis = np.array([axes[name] for name in model.joints])  # (n, 3)
+    across = np.stack([np.linalg.svd([x])[2][1:] for x in axis])  # (n, 2, 3)
+    engine, Z = model.pin_model, by.by_axis[:, :, j].copy()
+    for k in (k for k in range(len(axis)) if engine.parents[k + 1] == j + 1):
+        place = engine.jointPlacements[k + 1]  # it turns back about the origin of joint j
+        back = across[j] @ place.rotation  # (2, 3), in the frame of joint k
+        Z -= by.by_origin[:, :, k] @ np.cross(across[j], place.translation).T
+        Z -= by.by_axis[:, :, k] @ across[k] @ back.T + by.by_q[:, :, k, None] * (back @ axis[k])
+    return Z
 
 
 def _still(at: Sequence[Trajectory]) -> list[Trajectory]:
@@ -189,27 +207,21 @@ class _Alteration:
         """Return the values of the finding for sizes (c,)."""
         joint, is_one = "".join(self.joints[:1]), len(self.joints) == 1
         sense = "one" if is_one else "more" if x[0] > 0 else "less"
+        residual: dict[str, float | str] = {"what": "residual", "cure": "residual"}
+        factor: dict[str, float | str] = {"factor": 1 + x[0]}
         values: dict[str, dict[str, float | str]] = {
             "position_offset": {"correction": -x[0], "unit": unit},
             "lost_motion": {"unit": unit},
-            "angle_scale": {
-                "factor": 1 + x[0],
-                "named": f"q_{joint}" if joint else "every position",
-            },
-            "torque_scale": {"factor": 1 + x[0], "what": sense, "cure": sense},
-            "time_scale": {
-                "factor": 1 + x[0],
-                "speed": np.sqrt(max(1 + x[0], 0.0)),
-                "what": "residual",
-                "cure": "residual",
-            },
+            "angle_scale": factor | {"named": f"q_{joint}" if joint else "every position"},
+            "torque_scale": factor | {"what": sense, "cure": sense},
+            "time_scale": factor | residual | {"speed": np.sqrt(max(1 + x[0], 0.0))},
             "joint_origin": {"named": joint or "a joint"},
             "external_force": {"what": "constant", "cure": "constant"},
         }
         more: dict[str, float | str] = {"named": ", ".join(self.joints) or "all joints"}
         more, applied = more | values.get(self.reading.code, {}), self.reading.applied
         if applied is not None:
-            more |= {"what": "residual", "cure": "residual"}
+            more |= residual
             if self.reading.code == "gravity":
                 g = applied(self.on, x)[0].pin_model.gravity.linear
                 more["best"] = ", ".join(f"{value:.2f}" for value in g)
@@ -409,7 +421,7 @@ def _accepted(
         if best.reading.applied is not None and len(accepted.columns) == len(size):
             applied = partial(best.reading.applied, best.on)
             size, error, corrected = _refined(applied, size, sample.standard, sample)
-        others = [one for one in accepted.others if one.joints]
+        others = [(one.reading.code, one.joints) for one in accepted.others if one.joints]
         unit = "m" if model.layout.prismatic.intersection(best.joints) else "rad"
         norm, norm_error = float(np.linalg.norm(size)), float(np.linalg.norm(error))
         angle, angle_error = np.degrees(np.arctan([norm, norm_error]))
@@ -419,7 +431,7 @@ def _accepted(
             f"log_differs:{best.reading.code}" if log else best.reading.code, log, best.joints,
             subject="" if best.joints or log else "all joints", severity="warning", explained=True,
             also=bool(others), size=norm, std_error=norm_error, share_pct=100 * accepted.share,
-            others=listed(f"{one.reading.code} of {', '.join(one.joints)}" for one in others),
+            others=listed(f"{x.partition(':')[0]} of {', '.join(joints)}" for x, joints in others),
             angle=angle, angle_error=angle_error, **best.values(size, unit),
         )  # fmt: skip
         yield best, explained, corrected

@@ -178,13 +178,14 @@ def _limit_findings(joint: Any) -> Iterator[Finding]:  # noqa: ANN401
     """Yield a finding if a joint has no range, or limits of speed or torque that are 0."""
     lower, upper = (getattr(joint.limit, key, None) for key in ("lower", "upper"))
     has_range = joint.type not in ("revolute", "prismatic") or (lower or 0.0) < (upper or 0.0)
+    ends = ("missing" if end is None else str(end) for end in (lower, upper))
     flags = {"velocity": "--max-velocity", "effort": "--max-torque"}
     zero = [key for key in flags if getattr(joint.limit, key, None) == 0.0]
     zero = zero if joint.type in MOVABLE else []
     if zero or not has_range:
         yield finding(
-            "no_limits", subject=f"joint {joint.name}", name=joint.name,
-            range="none" if has_range else joint.type, lower=str(lower), upper=str(upper),
+            "no_limits", subject=f"joint {joint.name}", joint=joint.name,
+            range="none" if has_range else joint.type, lower=next(ends), upper=next(ends),
             zero="none" if not zero else "alone" if has_range else "also",
             limits=" and ".join(f"{key} 0" for key in zero),
             flags=" ".join(f"{flags[key]} {joint.name}=X" for key in zero),

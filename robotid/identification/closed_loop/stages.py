@@ -1,5 +1,6 @@
 """The stages of a closed-loop identification: initial values, fit, friction terms, step size."""
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -62,6 +63,8 @@ from robotid.identification.pipeline import conclude, in_memory
 from robotid.identification.result import TorqueIdentification
 from robotid.robot.model import RobotModel
 
+_log = logging.getLogger(__name__)
+
 #: Largest change of a parameter by halving the steps [standard errors].
 CHANGE = 0.2
 #: The stages of a job's fit, from reading logs to writing files.
@@ -122,6 +125,12 @@ def fit_loops(
     is_plain, every = initialised.linear is None, simulator.windows
     if is_plain:
         simulator = replace(simulator, windows=_few(every, 4 * _FEW))
+    if len(simulator.windows) < len(every):
+        _log.warning(
+            "%.0f s of logs are simulated in each step of the fit: 1 to 2 s of processor time for "
+            "each second. To be faster, select parts with start and end",
+            sum(np.ptp(log.t) for log in logs),
+        )
     for left in reversed(range(_STARTS)):
         if not left and np.any(initialised.limited):
             simulator, theta = _with_limits_reached(initialised, simulator, theta)

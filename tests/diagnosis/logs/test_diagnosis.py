@@ -11,6 +11,7 @@ from helpers.corruptions import CASES, NOISE, ROBOTS, clean_log, controlled_log,
 from helpers.driven import arm
 from helpers.synthetic import exact_log, perfect, truth
 
+from robotid.base.findings import grouped
 from robotid.cli import main
 from robotid.cli.doctor import doctor
 from robotid.cli.job import Job, LogEntry, read_job
@@ -445,8 +446,9 @@ def test_the_doctor_finds_the_traps_of_a_real_recording(recordings, monkeypatch,
 
 def test_joints_that_turn_freely_but_are_stated_without_limits_are_named(recordings):
     found = inspect_urdf(recordings / "kinova_gen3" / "robot.urdf").findings
-    joints = {f.where for f in found if f.code == "no_limits"}
-    assert joints == {f"joint joint_{k}" for k in (1, 3, 5, 7)}
+    (cause,) = (c for c in grouped(found) if c.code == "no_limits")
+    assert {f.where for f in cause.findings} == {f"joint joint_{k}" for k in (1, 3, 5, 7)}
+    assert len(cause.messages) == 1
 
 
 # --- repeated motions and excitation --------------------------------------------------------------

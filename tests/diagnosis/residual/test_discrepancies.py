@@ -209,20 +209,27 @@ def test_a_joint_that_lies_elsewhere_is_named(model, tmp_path):
     assert first.evidence["size"] == pytest.approx(0.05, rel=0.25)
 
 
-def rewritten(path, joint, key, change):
-    """Write a UR5 with another ``xyz`` or ``rpy`` of the origin of a joint."""
+def rewritten(path, joint, key, change, element="origin"):
+    """Write a UR5 with another ``xyz`` or ``rpy`` of the origin, or axis, of a joint."""
     tree = ET.parse(example_urdf("ur5_robot.urdf"))
-    (origin,) = tree.getroot().findall(f"joint[@name='{joint}']/origin")
-    values = np.array([float(x) for x in origin.get(key).split()]) + change
-    origin.set(key, " ".join(str(x) for x in values))
+    (place,) = tree.getroot().findall(f"joint[@name='{joint}']/{element}")
+    values = np.array([float(x) for x in place.get(key).split()]) + change
+    place.set(key, " ".join(str(x) for x in values))
     tree.write(path)
     return path
 
 
-def test_a_joint_axis_of_another_direction_is_named(model, tmp_path):
-    tilted = rewritten(tmp_path / "tilted.urdf", "wrist_1_joint", "rpy", [np.radians(8), 0, 0])
+@pytest.mark.parametrize(
+    ("joint", "key", "element", "change"),
+    [
+        ("wrist_1_joint", "rpy", "origin", [np.radians(8), 0, 0]),
+        ("shoulder_lift_joint", "xyz", "axis", [np.sin(0.14), np.cos(0.14) - 1, 0]),
+    ],
+)
+def test_a_joint_axis_of_another_direction_is_named(model, tmp_path, joint, key, element, change):
+    tilted = rewritten(tmp_path / "tilted.urdf", joint, key, change, element)
     first = found(model, lambda log: log, robot=tilted)[0]
-    assert (first.code, first.where) == ("axis_direction", "wrist_1_joint")
+    assert (first.code, first.where) == ("axis_direction", joint)
     assert first.evidence["angle"] == pytest.approx(8.0, rel=0.2)
     assert "its axis is tilted by" in first.message
 
@@ -297,13 +304,13 @@ def test_a_force_or_gravity_that_changes_in_time_is_the_only_finding(model, forc
 
 def grasped(log, model):
     """Return a log of which the last link carries 1.2 kg, 0.1 m from its joint, from 9.5 s on."""
-    engines = model.pin_model, model.pin_model.copy()
-    engines[1].inertias[6] += pin.Inertia(1.2, np.array([0.0, 0.0, 0.1]), 1e-3 * np.eye(3))
-    tau, a = log.tau.copy(), np.gradient(log.v, log.t, axis=0)
-    for k in np.flatnonzero(log.t > 9.5):
-        before, after = (pin.rnea(x, x.createData(), log.q[k], log.v[k], a[k]) for x in engines)
-        tau[k] += after - before
-    return replace(log, tau=tau)
+    robot, a = model.pin_model.copy(), np.gradient(log.v, log.t, axis=0)
+    for k in range(1, 7):
+        robot.inertias[k] = pin.Inertia.Zero()
+    robot.inertias[6] = pin.Inertia(1.2, np.array([0.0, 0.0, 0.1]), 1e-3 * np.eye(3))
+    at = zip(log.q, log.v, a, strict=True)
+    load = np.array([pin.rnea(robot, robot.createData(), *x) for x in at])
+    return replace(log, tau=log.tau + load * (log.t > 9.5)[:, None])
 
 
 def test_a_load_that_is_grasped_during_the_recording_is_named_with_mass_and_time(model):

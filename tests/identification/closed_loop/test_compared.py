@@ -8,6 +8,7 @@ from helpers.mujoco_plant import plant, recorded
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
+from robotid.identification.closed_loop import stages
 from robotid.identification.closed_loop.from_commands import identify_loops, loop_findings
 from robotid.identification.closed_loop.loop_settings import LoopSettings, groups_of
 from robotid.identification.closed_loop.stages import fit_loops
@@ -65,6 +66,12 @@ def test_speeds_that_are_better_than_positions_make_it_surer(leg):
     assert np.median(surer[[not name.endswith("offset") for name in names]]) < 0.8
     for found in (plain, both):
         assert_recovered(leg[0], found.estimate, {})
+
+
+def test_the_time_of_a_long_fit_is_stated_before_it_begins(leg, monkeypatch, caplog):
+    monkeypatch.setattr(stages, "_FEW", 1)  # long: more than eight windows
+    fitted(leg, window=0.25, lead=0.05)
+    assert caplog.messages[0].startswith("2 s of logs are simulated in each step of the fit: 1 to")
 
 
 def test_velocities_that_are_not_those_of_the_positions_are_refused(leg):

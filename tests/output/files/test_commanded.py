@@ -18,6 +18,7 @@ from helpers.paths import DOCS, ROOT
 from robotid.base.exceptions import DataError
 from robotid.cli import main
 from robotid.output.files.exports import formats
+from robotid.output.files.isaac import isaac_actuators
 from robotid.output.files.result_file import limit_of, load_result
 from robotid.robot.examples import example_urdf
 from robotid.robot.tree import Joint
@@ -240,6 +241,11 @@ def test_isaac_actuators_are_grouped_and_read_back(result, tmp_path, capsys):
             "min_delay": 3 if joint != LEG[2] else 2,  # 3.15 and 1.8 steps
             "max_delay": 3 if joint != LEG[2] else 2,
         }
+    names = ("hip.1", "hip_1", "knee")  # each group matches its own joints alone
+    others = [replace(drive, joint=name) for drive, name in zip(drives, names, strict=True)]
+    for group in isaac_actuators(model, others, 0.002)["actuators"].values():
+        (pattern,) = group["joint_names_expr"]
+        assert sum(re.fullmatch(pattern, name) is not None for name in names) == 1
 
 
 def test_the_pages_name_each_format():

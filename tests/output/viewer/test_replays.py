@@ -244,8 +244,12 @@ def test_keyframes_have_the_true_times_at_the_rate(page):
 
 
 def test_every_keyframe_is_the_robot_s_pose(arm, motion, tmp_path, rng):
-    t, q = motion
-    for model in (arm, mimicking(tmp_path, rng)):  # joints that follow, with an offset
+    t, joints = motion
+    turn = 0.3 * joints[:, 0]
+    base = np.column_stack([turn, -turn, turn**2, 0 * turn, np.sin(turn), 0 * turn, np.cos(turn)])
+    floating = RobotModel.from_urdf(arm.tree.path, free_flyer=True)
+    follows = mimicking(tmp_path, rng)  # joints that follow, with an offset
+    for model, q in ((arm, joints), (follows, joints), (floating, np.hstack([base, joints]))):
         data = shown(replay(model, t, q).html)
         times, moved = data["motion"]["t"], data["motion"]["q"]
         pinned = model.pin_model.createData()
