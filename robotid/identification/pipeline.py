@@ -139,8 +139,7 @@ def conclude(
     others = [f for f in doctor_findings if f.severity != "note" and f.code not in replaced]
     merged = settled(others, of_fit)
     merged = [finding for finding in merged if not explained_by_assumed(model, finding)]
-    merged = rejected(merged, result.predictions, result.scale_check)
-    merged = explained(merged, model, ignore)
+    merged = explained(rejected(merged, result.predictions, result.scale_check), model, ignore)
     log_errors = blocking(merged, ignore, is_robust=is_robust)
     heads = [log.head for log in (*recordings.fitted, *recordings.validation)]
     assumed = assumed_inertials(model)  # which the doctor finds, too, if it has run

@@ -63,8 +63,7 @@ def diagnose(
         names = ", ".join(log.name for log in fitted)
         findings += check_excitation(model, mapping, moving, signals, names)
         findings += [x for x in rounded_angles(model, mapping) if x.evidence["felt"]]
-    findings = explained(findings, model)
-    return by_severity(x for x in findings if not explained_by_assumed(model, x))
+    return by_severity(x for x in explained(findings, model) if not explained_by_assumed(model, x))
 
 
 def findings_to_dict(findings: Sequence[Finding]) -> dict[str, Any]:

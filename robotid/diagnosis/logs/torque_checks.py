@@ -55,8 +55,7 @@ class TorqueCheck:
 
     def loads(self, name: str) -> Iterator[Finding]:
         """Yield another scale, a load or another robot, and torques that nothing explains."""
-        moving = [j for samples, _ in self.limbs for j in samples.motion.rows]
-        bad = [j for j in moving if self.share[j] > _UNEXPLAINED]
+        bad = [j for x, _ in self.limbs for j in x.motion.rows if self.share[j] > _UNEXPLAINED]
         yield from _check_loads(self.probe, self.share, name, not bad)
         if 2 * len(bad) > len(self.share):
             yield finding(
@@ -65,10 +64,8 @@ class TorqueCheck:
             )  # fmt: skip
             return
         for j in bad:
-            yield finding(
-                "unexplained_torque", name, self.probe.model.joints[j], what="joint",
-                share=self.share[j],
-            )  # fmt: skip
+            joint = self.probe.model.joints[j]
+            yield finding("unexplained_torque", name, joint, what="joint", share=self.share[j])
 
 
 def is_suspect(check: TorqueCheck, others: Sequence[TorqueCheck]) -> bool:
@@ -145,10 +142,9 @@ def _finding(samples: Samples, one: Best, log: str) -> Finding:
         values["severity"] = "error" if angle > _WRONG_TILT else "warning"
     elif reading.code == "position_offset":
         values["offset"] = reading.values[0]
-    elif reading.code == "time_scale":
-        values["speed"] = float(np.exp(-reading.values[0]))
-    elif reading.code == "current_for_torque":
-        values["factor"] = float(np.exp(-reading.values[0]))
+    elif reading.code in ("time_scale", "current_for_torque"):
+        key = "speed" if reading.code == "time_scale" else "factor"
+        values[key] = float(np.exp(-reading.values[0]))
     elif reading.code == "gravity_compensated":
         values["what"] = "joint" if names else "robot"
     return finding(reading.code, log, names, **values)
@@ -225,8 +221,7 @@ def load_model(probe: Probe, share: Array) -> LoadModel:
 
 def _check_loads(probe: Probe, share: Array, name: str, is_explained: bool) -> Iterator[Finding]:
     """Yield torques in another scale, a payload, a URDF of another robot."""
-    # A common scale must fit with about the URDF's masses; else the URDF is of another robot. All
-    # torques must be explained by some masses: others are no evidence of them.
+    # A common scale must fit with about the URDF's masses; else the URDF is of another robot.
     model = load_model(probe, share)
     _, theta, error = model.fit()
     is_this_robot = model.is_this_robot()
@@ -265,8 +260,7 @@ def _error_of_links(theta: Array) -> float:
 
 
 def _torque_scale(model: LoadModel) -> tuple[float, bool]:
-    """Return the best factor of all torques beyond errors of masses, and whether one is better."""
-    # It, or the factor of one torque, reduces the misfit significantly.
+    """Return the best common factor beyond errors of masses, and whether it or one is better."""
     far = _SCALES[np.abs(np.log(_SCALES)) > np.log(NO_ERROR_OF_MASSES)]
     common = float(min(far, key=model.misfit))
     each = np.where(np.eye(len(model.R), dtype=bool)[:, None], _SCALES[:, None], 1.0)

@@ -402,12 +402,12 @@ def _accepted(
 ) -> Iterator[tuple[_Alteration, Finding, Sample]]:
     """Yield the alterations that explain the residual, findings, and the corrected samples."""
     trials, offered = Trials.of(sample, possible)
-
-    def complexity(one: _Alteration) -> tuple[int, int]:
-        return len(offered[one]), len(one.joints)  # number of sizes, and of joints named
-
     rule = replace(decisions.ALTERATION, alike=decisions.AGREES) if log else decisions.ALTERATION
-    for accepted in trials.accepted(offered, rule, complexity):
+    for accepted in trials.accepted(
+        offered,
+        rule,
+        lambda one: (len(offered[one]), len(one.joints)),  # of sizes, of joints named
+    ):
         best, size, error = accepted.option, accepted.theta, np.sqrt(np.diag(accepted.covariance))
         least, needed = best.reading.least, _needed(accepted)
         significant = decisions.SIGNIFICANT * float(np.linalg.norm(error))
@@ -442,12 +442,11 @@ def _needed(accepted: Accepted[_Alteration]) -> float:
     share, confirmed = accepted.share, accepted.confirmed
     if accepted.p_value > decisions.P_VALUE:
         return np.inf
-    if share >= decisions.LEAST_SHARE:
-        is_confirmed = confirmed is None or confirmed > decisions.CONFIRMED * share
-        return 1.0 if is_confirmed else np.inf
+    is_confirmed = confirmed is None or confirmed > decisions.CONFIRMED * share
+    if share >= decisions.LEAST_SHARE and is_confirmed:
+        return 1.0
     is_weak = confirmed is not None and confirmed > share > decisions.WEAK
-    is_weak = is_weak and accepted.p_value < decisions.WEAK_P_VALUE
-    return decisions.WEAK_SIZE if is_weak else np.inf
+    return decisions.WEAK_SIZE if is_weak and accepted.p_value < decisions.WEAK_P_VALUE else np.inf
 
 
 def _refined(

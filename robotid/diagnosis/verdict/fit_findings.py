@@ -11,15 +11,8 @@ from robotid.base.findings import Finding, listed
 from robotid.base.tolerances import CONVERGED, TINY
 from robotid.base.typing import Array
 from robotid.data.log import Log
+from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import (
-    DIFFERS,
-    LEAST_SHARE,
-    NO_ERROR_OF_MASSES,
-    SHARE_OF_ROWS,
-    TENFOLD,
-    ZERO,
-)
 from robotid.diagnosis.residual.misfit import Misfit, misfit_finding
 from robotid.diagnosis.urdf.inertials import DENSEST, audit_bodies
 from robotid.diagnosis.verdict.parameter_table import correlated_parameters
@@ -139,7 +132,7 @@ def _drive_findings(fit: Fit) -> Iterator[Finding]:
                 x, (low, high) = getattr(motion, key)[mask[:, j], j], choice.data_range[key]
                 x, low = (np.abs(x), 0.0) if key == "v" else (x, low)
                 share = float(np.mean((x < low) | (x > high))) if len(x) else 0.0
-                if share > SHARE_OF_ROWS:
+                if share > decisions.SHARE_OF_ROWS:
                     yield finding(
                         "beyond_range", "", choice.joint, share_pct=100 * share, low=low, high=high,
                         what={"q": "positions", "v": "speeds"}[key],
@@ -170,7 +163,7 @@ def correlated_findings(fit: Fit) -> Iterator[Finding]:
         )  # fmt: skip
     for choice in fit.drives:
         name = max(choice.grown, key=lambda name: choice.grown[name], default="")
-        if choice.joint not in joints and choice.grown.get(name, 1.0) > TENFOLD:
+        if choice.joint not in joints and choice.grown.get(name, 1.0) > decisions.TENFOLD:
             yield finding(
                 "correlated_terms", "", choice.joint, what="grown", name=name,
                 families=listed(choice.families), grown=choice.grown[name],
@@ -249,9 +242,9 @@ def _total_mass(fit: Fit) -> Iterator[Finding]:
     size = fit.model.layout.n_inertial
     pi = np.array([fit.prior, fit.standard])
     before, after = pi[:, :size:10].sum(axis=1).tolist()
-    is_open = fit.estimator.bounds.total is None and before > 0
-    if is_open and not before / NO_ERROR_OF_MASSES <= after <= NO_ERROR_OF_MASSES * before:
-        evidence = {"urdf": before, "identified": after, "far": NO_ERROR_OF_MASSES}
+    is_open, far = fit.estimator.bounds.total is None and before > 0, decisions.NO_ERROR_OF_MASSES
+    if is_open and not before / far <= after <= far * before:
+        evidence = {"urdf": before, "identified": after, "far": far}
         yield finding("total_mass", subject="standard_parameters", **evidence)
 
 
@@ -265,7 +258,7 @@ def encoder_noise(fit: Fit) -> Iterator[Finding]:
     worst = int(np.argmax(moved))
     if moved[worst] < _BIASED:
         return
-    coarse = np.flatnonzero(noise.share > LEAST_SHARE * noise.share.max())
+    coarse = np.flatnonzero(noise.share > decisions.LEAST_SHARE * noise.share.max())
     steps = {model.joints[j]: noise.steps[j] for j in coarse}
     coarsest = max(steps, key=lambda joint: steps[joint])
     is_prismatic = coarsest in model.layout.prismatic
@@ -302,11 +295,9 @@ def _impossible_shapes(fit: Fit) -> Iterator[Finding]:
         if (fault.code, fault.where) in before:
             yield fault.reworded(severity="note", remedy="; the URDF has the same fault")
             continue
-        severity, remedy = (
-            fault.severity,
-            f". {_cure(fit, body)}. The predicted torque may still be ",
-        )
-        remedy += "right; do not use mass, centre of mass and inertia of this link"
+        severity = fault.severity
+        remedy = f". {_cure(fit, body)}. The predicted torque may still be right; do not use mass, "
+        remedy += "centre of mass and inertia of this link"
         if _is_within_box(fit, body, boxes[body]):
             severity, remedy = "note", "; it is within the margin of the fit"
         text = f"as identified, {fault.fault}"
@@ -385,7 +376,8 @@ def _locked_links(fit: Fit) -> str:
         np.linalg.eigvalsh(pseudo_inertia(pi[:size] - held))[:, 0]
         for pi in (identified, model.standard_parameters())
     )
-    is_shrunk = (own < DIFFERS * before) & (held[::10] > DIFFERS * identified[::10])
+    is_shrunk = own < decisions.DIFFERS * before
+    is_shrunk &= held[::10] > decisions.DIFFERS * identified[::10]
     return "".join(
         f"the URDF's inertials of the links on locked joints, {held[10 * k]:.3g} kg of the "
         f"{identified[10 * k]:.3g} kg of {model.layout.bodies[k]} (identify their joints, too, if "
@@ -404,7 +396,7 @@ def _contradiction(fit: Fit) -> tuple[str, dict[str, str]]:
     masses, before = (pi[: layout.n_inertial : 10] for pi in (fit.standard, urdf))
     vanished = [
         f"{layout.bodies[k]} has {masses[k]:.2g} of its {before[k]:.3g} kg"
-        for k in np.flatnonzero(masses < ZERO * before)
+        for k in np.flatnonzero(masses < decisions.ZERO * before)
     ]
     return ("vanished", {"vanished": ", ".join(vanished)}) if vanished else ("harmless", {})
 

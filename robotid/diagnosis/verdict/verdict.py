@@ -485,10 +485,10 @@ def rejected(
     for one in findings:
         joints = [joint for joint in one.joints if joint in errors] or [*errors]
         worst = max((errors[joint] for joint in joints), default=np.inf)
-        gravity, total = scale_check.gravity, scale_check.factor
+        gravity = scale_check.gravity
         ratios = {
             "current_for_torque": [gravity[joint] for joint in joints if joint in gravity],
-            "gravity_compensated": [np.inf if scale_check.scale is None else total],
+            "gravity_compensated": [np.inf if scale_check.scale is None else scale_check.factor],
         }.get(one.code, [np.inf] if one.severity == "error" else [])
         is_near = all(1 / _MUCH < ratio < _MUCH for ratio in ratios)
         # one of all joints was found in the residual of the prediction

@@ -329,23 +329,23 @@ def _parameter(entry: Mapping[str, Any], on_misfit: Collection[str]) -> dict[str
 
 
 def _drive_table(entries: Sequence[Mapping[str, Any]]) -> str:
-    drives: dict[str, dict[str, Mapping[str, Any]]] = {}
+    drives: dict[str, dict[tuple[str, str], Mapping[str, Any]]] = {}
     for entry in entries:
         owner, _, term = entry["name"].rpartition(".")
         if term not in INERTIAL_TERMS:
-            drives.setdefault(owner, {})[term] = entry
+            unit = _MILLI.get(entry["unit"], entry["unit"])
+            drives.setdefault(owner, {})[term, unit] = entry
     known = {
-        term: entry
+        (term, unit): term
         for terms in drives.values()
-        for term, entry in terms.items()
+        for (term, unit), entry in terms.items()
         if entry["value"] or entry.get("std_error") is not None
     }  # all other terms are fixed at 0
-    terms = sorted(known, key=lambda term: (*_FIRST_TERMS, term).index(term))
-    units = [_MILLI.get(known[term]["unit"], known[term]["unit"]) for term in terms]
-    names = [f"{term} [{unit}]" for term, unit in zip(terms, units, strict=True)]
-    cells = [[_short(own.get(term)) for term in terms] for own in drives.values()]
+    columns = sorted(known, key=lambda column: (*_FIRST_TERMS, known[column]).index(known[column]))
+    names = [f"{term} [{unit}]" for term, unit in columns]
+    cells = [[_short(own.get(column)) for column in columns] for own in drives.values()]
     rows = [[code(drive), *row] for drive, row in zip(drives, cells, strict=True)]
-    return table("Drives, by joint", ["joint", *names], rows, is_data=True) if terms else ""
+    return table("Drives, by joint", ["joint", *names], rows, is_data=True) if columns else ""
 
 
 def _error(entry: Mapping[str, Any]) -> float:
