@@ -246,10 +246,9 @@ def explain_residual(
         explained = altered_by[0][2].with_columns(altered)
     unlike = unlike_log(sample) if is_one_robot else None
     if unlike is not None:
-        # it is only compared if no term or reading of all logs explains its residual
         every = explained.with_columns(_columns(misfits, sample)) if misfits else explained
-        if unlike_log(every) is not None:
-            sample, between = _between_logs(model, sample, unlike)
+        if unlike_log(every) is not None:  # no term or reading of all logs explains it
+            sample, between = _between(model, sample, unlike)
             misfits, others = explain_residual(fit, sample, is_one_robot=False)
             return misfits, (*between, *others)
     changing = tuple(_changing(model, sample, [x for x in table if x.changes], possible))
@@ -267,9 +266,7 @@ def explain_residual(
     return misfits, tuple(one for _, one, _ in altered_by)
 
 
-def _between_logs(
-    model: RobotModel, sample: Sample, others: OtherLogs
-) -> tuple[Sample, list[Finding]]:
+def _between(model: RobotModel, sample: Sample, others: OtherLogs) -> tuple[Sample, list[Finding]]:
     """Return samples with columns for what is different in one log, and its finding."""
     own, rows = others.left_out(sample)
     possible = alterations(model, [*_of_log(model, own, others)])
@@ -297,11 +294,10 @@ def _of_log(model: RobotModel, sample: Sample, others: OtherLogs) -> Iterator[Re
     yield Reading("time_scale", 0.04, [()], lambda on: inertial[..., None])
     last = slice(model.layout.n_inertial - 10, model.layout.n_inertial)
     load = np.concatenate([regressor(model, motion)[..., last] for motion in at])
-    weight = sample.weight[..., None]
-    robot = sample.W[..., : len(sample.U)] / np.where(weight > 0.0, weight, np.inf)
+    weight = np.where(sample.weight > 0.0, sample.weight, np.inf)[..., None]
     yield Reading("payload", 0.0, [()], lambda on: load)
     if others.is_out.count(False) > 1:  # they agree: it is no error of the model
-        yield Reading("robot", 0.0, [()], lambda on: robot)
+        yield Reading("robot", 0.0, [()], lambda on: sample.W[..., : len(sample.U)] / weight)
 
 
 def _columns(misfits: Sequence[Misfit], sample: Sample) -> Array:

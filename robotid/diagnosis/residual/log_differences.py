@@ -2,8 +2,7 @@
 
     r = tau - Y pi_others = W delta + e,    delta ~ N(0, C),    C^-1 = C_0^-1 + sum of W_o^T W_o,
 
-with a sum over the other logs. Its friction and offsets are free: they change with load and
-temperature. What explains r is a difference between this log and the others (``discrepancies``).
+with a sum over the other logs. Friction and offsets of the log are free: they may have changed.
 """
 
 from collections.abc import Sequence
@@ -19,7 +18,7 @@ from robotid.diagnosis.residual.term_trials import Normal, Sample, cut_segments
 
 
 def unlike_log(sample: Sample) -> "OtherLogs | None":
-    """Return the fit to all logs but the one that contradicts them; None if all are alike."""
+    """Return the fit to all logs but the one that contradicts them, the later of two."""
     paths = [x.log.path or str(k) for k, x in enumerate(sample.recordings)]  # "": in memory
     logs, log_of = list(dict.fromkeys(paths)), np.repeat(paths, [len(k) for k in sample.taken])
     if len(logs) < 2:
@@ -31,7 +30,6 @@ def unlike_log(sample: Sample) -> "OtherLogs | None":
         for log, x in zip(logs, each, strict=True)
     ]
     excess = np.array([fit.excess(own) for fit, own in zip(others, each, strict=True)])
-    # of two logs, the later one is named
     k = 1 if len(logs) == 2 else int(np.argmax(np.log(excess + NOTHING).sum(axis=1)))
     return others[k] if excess[k].max() * BETTER**2 > 1.0 else None
 

@@ -5,17 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.corruptions import clean_log, robot
-from helpers.paths import ROOT
 
-from robotid.cli.identify import identify_job
-from robotid.cli.job import LogEntry, read_job
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.residual.discrepancies import explain_residual
 from robotid.diagnosis.residual.log_differences import unlike_log
 from robotid.diagnosis.residual.term_trials import take_sample
 from robotid.dynamics.simulation.simulator import another_robot
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.work_plan import WorkPlan
 from robotid.identification.pipeline import in_memory, with_drives
 from robotid.robot.drives import wanted_families
 
@@ -25,16 +21,15 @@ PI = another_robot(MODEL, np.random.default_rng(0))
 
 @pytest.fixture(scope="module")
 def logs():
-    every = (clean_log(MODEL, seed, pi=PI, rate=50.0, duration=10.0) for seed in range(3))
-    return [replace(log, path=f"run{k}.csv") for k, log in enumerate(every)]
+    how = {"pi": PI, "rate": 50.0, "duration": 10.0}
+    return [clean_log(MODEL, k, **how, path=f"run{k}.csv") for k in range(3)]
 
 
 def with_load(mass, pi=PI):
     loaded = pi.copy()
     last = loaded[: MODEL.layout.n_inertial].reshape(-1, 10)[-1]
     last += mass * np.array([1, 0, 0.05, 0.1, 0.02, 0, 0.02, 0, 0, 0.02])
-    log = clean_log(MODEL, 2, pi=loaded, rate=50.0, duration=10.0)
-    return replace(log, path="run2.csv")
+    return clean_log(MODEL, 2, pi=loaded, rate=50.0, duration=10.0, path="run2.csv")
 
 
 def sample_of(fitted, validation=()):
@@ -56,26 +51,21 @@ def test_a_load_in_the_validation_log_only_is_weighed(logs):
     assert (change.where, change.severity) == ("run2.csv", "warning")
     assert change.evidence["size"] == pytest.approx(1.0, rel=0.1)
     assert change.evidence["std_error"] < 0.05
-    assert "the last link carries about +0.9" in change.message
     (change,) = differences([loaded], logs[:1])
     assert change.evidence["size"] == pytest.approx(-1.0, rel=0.1)
-    # of three logs the one that contradicts the others, wherever it stands
     (change,) = differences([with_load(0.5), *logs[:2]])
-    assert change.where == "run2.csv"
-    assert change.evidence["size"] == pytest.approx(0.5, rel=0.1)
+    assert (change.where, round(change.evidence["size"], 1)) == ("run2.csv", 0.5)
 
 
 def test_a_load_is_named_beside_a_urdf_of_another_robot():
-    """Links that weigh half or twice what the URDF says are no reason to miss a load."""
     rng = np.random.default_rng(4)
     size, pi = MODEL.layout.n_inertial, another_robot(MODEL, rng)
     links = pi[:size].reshape(-1, 10)
     links *= rng.choice([0.5, 2.0], (len(links), 1))
     fitted = replace(clean_log(MODEL, 5, pi=pi, rate=50.0, duration=10.0), path="run5.csv")
     (change,) = differences([fitted], [with_load(1.0, pi)])
-    mass, error = change.evidence["size"], change.evidence["std_error"]
-    assert mass == pytest.approx(1.0, abs=4 * error)
-    assert error < 0.05
+    assert change.evidence["std_error"] < 0.05
+    assert change.evidence["size"] == pytest.approx(1.0, abs=4 * change.evidence["std_error"])
 
 
 @pytest.mark.parametrize(
@@ -115,17 +105,3 @@ def test_the_fit_to_the_other_logs_is_the_prior_of_a_log(logs):
     together = np.linalg.solve(X.T @ X + np.eye(b), X.T @ y)
     found = others.change + np.linalg.solve(others.L.T, change)
     np.testing.assert_allclose(found, together, rtol=1e-6, atol=1e-9)
-
-
-def test_a_load_on_a_recorded_arm_is_weighed(recordings, monkeypatch):
-    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
-    job = read_job(ROOT / "tests/jobs/ur10e.toml")
-    folder = job.identification[0].path.parent
-    bare, loaded = (
-        LogEntry(folder / f"ident_20200219_14harm{end}.parquet") for end in ("", "_load")
-    )
-    job = replace(job, identification=(loaded,), validation=(bare,), ignore=("repeated_motion",))
-    found = identify_job(job, job.model(), WorkPlan())
-    (change,) = [f for f in found.findings if f.code == "log_differs"]
-    # 2.805 kg; the stated gains make it 9 % more, as `robotid payload` weighs it
-    assert change.evidence["size"] == pytest.approx(-3.06, rel=0.06)
