@@ -637,10 +637,10 @@ CASES = {
         FINE, ("payload", "urdf_mismatch"), world="hand"
     ),
     "1 kg in the fitted log": Case(
-        NOT_GOOD, ("payload", "payload_change", "urdf_mismatch"), loads=(True, False)
+        NOT_GOOD, ("payload", "log_differs", "urdf_mismatch"), loads=(True, False)
     ),
     "1 kg in the validation log": Case(
-        NOT_GOOD, ("payload", "payload_change", "urdf_mismatch"), loads=(False, True)
+        NOT_GOOD, ("payload", "log_differs", "urdf_mismatch"), loads=(False, True)
     ),
     "1 kg in both": Case(FINE, loads=(True, True)),
     "URDF of another size": Case(

@@ -34,7 +34,6 @@ from robotid.diagnosis.verdict.fit_findings import (
     fit_findings,
     log_findings,
     not_written,
-    rescaled_findings,
     unlike_findings,
 )
 from robotid.diagnosis.verdict.scale_check import check_scale
@@ -122,10 +121,10 @@ def conclude(
         raise
     report_stage(progress, "errors and intervals")
     sample = take_sample(fit)
-    misfits, discrepancies = explain_residual(fit, sample)
+    units = sorted({log.unit for log in recordings.fitted})
+    misfits, discrepancies = explain_residual(fit, sample, is_one_robot=len(units) == 1)
     fit, on_misfit = with_model_error(fit, sample, misfits)
     names = [Path(e.recording.log.path).name for e in fit.fitted]
-    units = sorted({log.unit for log in recordings.fitted})
     fit = replace(fit, variation=vary(names, fit.runs, units))
     result = TorqueIdentification(
         **{field.name: getattr(fit, field.name) for field in fields(fit)},
@@ -134,11 +133,7 @@ def conclude(
         stated=StatedSettings(recordings.fitted[0].asked, friction, tuple(ignore)),
     )
     result = replace(result, scale=check_scale(result))
-    of_fit = [
-        *fit_findings(fit, misfits, on_misfit, discrepancies),
-        *unlike_findings(fit.variation),
-        *rescaled_findings(fit),
-    ]
+    of_fit = *fit_findings(fit, misfits, on_misfit, discrepancies), *unlike_findings(fit.variation)
     # notes, and what the doctor says of excitation and logs, are replaced by those of the fit
     replaced = ("excitation", "log_assumption")
     others = [f for f in doctor_findings if f.severity != "note" and f.code not in replaced]

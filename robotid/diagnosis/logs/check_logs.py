@@ -6,7 +6,6 @@ identification unless its code is ignored.
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,16 +24,11 @@ from robotid.diagnosis.logs import channels
 from robotid.diagnosis.logs.base_checks import examine_base
 from robotid.diagnosis.logs.command_channels import check_commands
 from robotid.diagnosis.logs.probe import Probe, smooth_motion, take_probe
-from robotid.diagnosis.logs.torque_checks import (
-    TorqueCheck,
-    check_payload_change,
-    is_suspect,
-    reductions_of,
-)
+from robotid.diagnosis.logs.torque_checks import TorqueCheck, is_suspect
 from robotid.diagnosis.logs.torque_delay import check_torque_delay
 from robotid.diagnosis.urdf.inertials import assumed_inertials, explained_by_assumed, rounded_angles
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
-from robotid.dynamics.factors import Reduction, compress, merge
+from robotid.dynamics.factors import compress, merge
 from robotid.dynamics.prepared_logs import base_problem, independent_share, row_mask
 from robotid.estimation.estimators import WLS, Estimate, determination
 from robotid.robot.model import RobotModel
@@ -61,19 +55,10 @@ def diagnose(
         same = [x.name for x in fitted[:k] if np.array_equal([x.q, x.tau], [log.q, log.tau])]
         findings += [finding("repeated_log", log.name, other=same[0])] if same else []
     moving = [probe.motion for probe in probes]
-    segments: list[Reduction] = []  # of the fitted motions, made if they are compared
     for one in examined[len(fitted) :]:
-        log, motion, probe = one.log, one.motion, one.probe
-        share = 0.0 if motion is None else repeated_share(first, motion)
+        share = 0.0 if one.motion is None else repeated_share(first, one.motion)
         if share >= REPEATED:
-            findings.append(finding("repeated_motion", log.name, share=share))
-        if probe is not None and mapping is not None:
-            reduced = partial(reductions_of, model, mapping, min_velocity=signals.min_velocity)
-            segments = segments or list(reduced(moving))
-            seconds = sum(float(np.ptp(m.t)) for m in (*moving, probe.motion))
-            independent = 2.0 * (signals.cutoff or np.inf) * seconds
-            both = segments, list(reduced([probe.motion]))
-            findings += check_payload_change(model, mapping, *both, independent, log.name)
+            findings.append(finding("repeated_motion", one.log.name, share=share))
     if mapping is not None:
         names = ", ".join(log.name for log in fitted)
         findings += check_excitation(model, mapping, moving, signals, names)

@@ -4,24 +4,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.special
 
 from robotid.base.findings import Finding, listed
 from robotid.base.tolerances import TINY
 from robotid.base.typing import Array
-from robotid.data.log import Trajectory
 from robotid.data.units import STATIC
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import BEYOND_NOISE, NO_ERROR_OF_MASSES, ROWS, SIGNIFICANT, ZERO
+from robotid.diagnosis.decisions import BEYOND_NOISE, NO_ERROR_OF_MASSES, SIGNIFICANT, ZERO
 from robotid.diagnosis.logs.probe import Probe
 from robotid.diagnosis.logs.readings import CERTAIN, EXPLAINED, Best, Samples, best_readings, limbs
-from robotid.dynamics.base_parameters import BaseMapping
-from robotid.dynamics.factors import Reduction, compress_segments
-from robotid.dynamics.prepared_logs import base_problem, row_mask
-from robotid.dynamics.rows import keep_inertial_rows
-from robotid.estimation.estimators.two_runs import payload_runs
-from robotid.robot.model import RobotModel
-from robotid.robot.prior import payload_spread, prior_spread
 
 _UNEXPLAINED = 0.25  # unexplained share of a torque's variance that is reported, not accepted
 _SPREAD = 0.3  # prior standard deviation of a link's mass, relative to the URDF's
@@ -34,9 +25,6 @@ _SCALES = np.logspace(-3, 3, 61)
 _WRONG_TILT = 30.0  # [deg] angle of gravity from the stated one that is an error
 _LARGE = 0.08  # payload over the arm's mass that errors of the links do not explain
 _MISMATCH = 7.5  # largest sum of squared errors of the links, in standard deviations
-_NOTHING = 0.01  # of the arm's mass, the smallest change of load
-_CLEARLY = 1.5  # least ratio of the misfit of other torque scales to that of a load
-_SEGMENT, _SEGMENTS = 0.4, 24  # [s] longer than the correlation of noise; most of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,56 +284,3 @@ def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Fin
         severity="warning" if abs(mass) - 2 * error > _LARGE * arm else "note",
         mass=mass, std_error=error, mcx=load[1], mcy=load[2], mcz=load[3],
     )  # fmt: skip
-
-
-def reductions_of(
-    model: RobotModel, mapping: BaseMapping, motions: Sequence[Trajectory], min_velocity: float
-) -> Iterator[Reduction]:
-    """Yield the reduced least-squares problem of each segment of motions, in order."""
-    for motion in motions:
-        thin = motion.every(max(1, len(motion.t) // ROWS))
-        keep_inertial_rows(model, thin)  # used for the excitation, too
-        count = int(np.clip(np.ptp(thin.t) / _SEGMENT, 1, _SEGMENTS))
-        length = -(-len(thin.t) // count)
-        problem = base_problem(
-            model, mapping, thin, row_mask(model, thin, min_velocity), compiled=False
-        )
-        for i, factors in enumerate(compress_segments(problem, length)):
-            part = thin.at(slice(i * length, (i + 1) * length))
-            yield Reduction(factors, part.squares, len(part.t))
-
-
-def check_payload_change(
-    model: RobotModel, mapping: BaseMapping, fitted: Sequence[Reduction],
-    validation: Sequence[Reduction], independent: float, name: str,
-) -> Iterator[Finding]:  # fmt: skip
-    """Yield a warning if a validation log has another load than the fitted ones."""
-    # Both logs are fitted together, with a load in the last link of the validation log only.
-    layout, every = model.layout, (*fitted, *validation)
-    squares, samples = sum(r.squares for r in every), sum(r.samples for r in every)
-    size = payload_spread(model)
-    last = mapping.K[:, layout.n_inertial - 10 : layout.n_inertial]
-    runs = payload_runs(
-        fitted, validation, layout, mapping.K, model.standard_parameters(),
-        prior_spread(model, np.asarray(squares), samples), (last, np.full(10, np.nan), size),
-        share=min(1.0, independent / samples),
-    )  # fmt: skip
-    theta, covariance = runs.alike()
-    least = SIGNIFICANT * float(np.sqrt(covariance[-10, -10]))
-    if abs(theta[-10]) <= max(least, _NOTHING * size[0]):
-        return  # standard errors with changes over time are not smaller
-    # the load is tested with errors that include changes over time; torque scales are tried below
-    changed = runs.compare(by_joint=False)
-    mass, error = float(changed.theta[-10]), float(np.sqrt(changed.covariance[-10, -10]))
-    p_value = scipy.special.ndtr(-SIGNIFICANT)
-    half_width = -float(scipy.special.stdtrit(changed.freedom[-10], p_value)) * error
-    if not max(half_width, _NOTHING * size[0]) < abs(mass) < size[0]:
-        return
-    left = runs.residual_ratios(changed.theta) - 1.0
-    by_scales = runs.residual_ratios_by_scales(runs.D.shape[1] - 10) - 1.0
-    if _CLEARLY * left.mean() > by_scales.mean():
-        return  # the logs differ by another effect
-    link = layout.bodies[-1]
-    yield finding(
-        "payload_change", name, subject=link, link=link, sense=mass > 0, mass=mass, std_error=error
-    )

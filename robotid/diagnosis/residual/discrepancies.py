@@ -22,6 +22,7 @@ from robotid.data.log import Trajectory
 from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import Option
+from robotid.diagnosis.residual.log_differences import OtherLogs, unlike_log
 from robotid.diagnosis.residual.misfit import Misfit, find_misfits
 from robotid.diagnosis.residual.term_trials import Accepted, Sample, Trials, along, regressor
 from robotid.dynamics.torque import (
@@ -219,7 +220,8 @@ class _Alteration:
             "joint_origin": {"named": joint or "a joint"},
             "external_force": {"what": "constant", "cure": "constant"},
         }
-        more, applied = values.get(self.reading.code, {}), self.reading.applied
+        more: dict[str, float | str] = {"named": ", ".join(self.joints) or "all joints"}
+        more, applied = more | values.get(self.reading.code, {}), self.reading.applied
         if applied is not None:
             more |= residual
             if self.reading.code == "gravity":
@@ -229,7 +231,7 @@ class _Alteration:
 
 
 def explain_residual(
-    fit: Fit, sample: Sample | None
+    fit: Fit, sample: Sample | None, *, is_one_robot: bool = True
 ) -> tuple[tuple[Misfit, ...], tuple[Finding, ...]]:
     """Return the terms that drive models lack, and differences of recordings or URDF."""
     # A spring and a position offset imitate each other: what explains more of the whole residual is
@@ -239,24 +241,65 @@ def explain_residual(
         return (), ()
     table = readings(model, fit.standard, sample)
     possible = alterations(model, [reading for reading in table if not reading.changes])
-    in_time = [reading for reading in table if reading.changes]
-    changing = tuple(_changing(model, sample, in_time, possible))
+    misfits, explained = find_misfits(sample), sample
+    altered_by = list(_accepted(model, sample, possible))
+    if altered_by:
+        altered = np.concatenate([possible[alteration] for alteration, *_ in altered_by], axis=2)
+        explained = altered_by[0][2].with_columns(altered)
+    unlike = unlike_log(sample) if is_one_robot else None
+    if unlike is not None:
+        every = explained.with_columns(_columns(misfits, sample)) if misfits else explained
+        if unlike_log(every) is not None:  # no term or reading of all logs explains it
+            sample, between = _between(model, sample, unlike)
+            misfits, others = explain_residual(fit, sample, is_one_robot=False)
+            return misfits, (*between, *others)
+    changing = tuple(_changing(model, sample, [x for x in table if x.changes], possible))
     if changing:  # it imitates all other readings and terms
         return (), changing
-    misfits = find_misfits(sample)
-    altered_by = list(_accepted(fit, sample, possible))
     if misfits and altered_by:
-        altered = np.concatenate([possible[alteration] for alteration, *_ in altered_by], axis=2)
         lacking = _columns(misfits, sample)
         if _left(sample, altered) < _left(sample, lacking):
             alone = {(misfit.joint, misfit.term.code) for misfit in misfits}
-            remaining = find_misfits(altered_by[0][2].with_columns(altered))
-            misfits = tuple(m for m in remaining if (m.joint, m.term.code) in alone)
+            misfits = tuple(m for m in find_misfits(explained) if (m.joint, m.term.code) in alone)
         else:
             among = {alteration for alteration, *_ in altered_by}
-            retested = _accepted(fit, sample.with_columns(lacking), possible)
+            retested = _accepted(model, sample.with_columns(lacking), possible)
             altered_by = [one for one in retested if one[0] in among]
     return misfits, tuple(one for _, one, _ in altered_by)
+
+
+def _between(model: RobotModel, sample: Sample, others: OtherLogs) -> tuple[Sample, list[Finding]]:
+    """Return samples with columns for what is different in one log, and its finding."""
+    own, rows = others.left_out(sample)
+    possible = alterations(model, [*_of_log(model, own, others)])
+    before = float(Trials(own, np.empty((*own.r.shape, 0))).held_out.left([]).sum())
+    noise = own.share * np.count_nonzero(own.weight)
+    for alteration, difference, _ in _accepted(model, own, possible, own.recordings[0].log.name):
+        left = (1.0 - 0.01 * difference.evidence["share_pct"]) * before - noise
+        if left > decisions.BETTER**2 * (before - noise):
+            break  # it is not clear
+        columns = np.zeros((*sample.r.shape, possible[alteration].shape[2]))
+        columns[rows] = possible[alteration]
+        return sample.with_columns(columns), [difference]
+    return sample, []
+
+
+def _of_log(model: RobotModel, sample: Sample, others: OtherLogs) -> Iterator[Reading]:
+    """Yield the readings of one log that differs from others: of its channels, a load, a robot."""
+    for reading in readings(model, sample.standard, sample):
+        if reading.code in ("position_offset", "torque_scale", "joint_delay", "gravity"):
+            together = [()] * (reading.code in ("torque_scale", "joint_delay"))
+            yield replace(reading, groups=[*reading.groups, *together])
+    pi, at = sample.standard, sample.at
+    friction = _drives(model, pi, [replace(m, a=0.0 * m.a) for m in at])
+    inertial = _torques(model, pi, at) - friction - _torques(model, _bodies(model, pi), _still(at))
+    yield Reading("time_scale", 0.04, [()], lambda on: inertial[..., None])
+    last = slice(model.layout.n_inertial - 10, model.layout.n_inertial)
+    load = np.concatenate([regressor(model, motion)[..., last] for motion in at])
+    weight = np.where(sample.weight > 0.0, sample.weight, np.inf)[..., None]
+    yield Reading("payload", 0.0, [()], lambda on: load)
+    if others.is_out.count(False) > 1:  # they agree: it is no error of the model
+        yield Reading("robot", 0.0, [()], lambda on: sample.W[..., : len(sample.U)] / weight)
 
 
 def _columns(misfits: Sequence[Misfit], sample: Sample) -> Array:
@@ -353,32 +396,41 @@ def _grasped(sample: Sample, step: Accepted[int]) -> Finding:
 
 
 def _accepted(
-    fit: Fit, sample: Sample, possible: Mapping[_Alteration, Array]
+    model: RobotModel, sample: Sample, possible: Mapping[_Alteration, Array], log: str = ""
 ) -> Iterator[tuple[_Alteration, Finding, Sample]]:
     """Yield the alterations that explain the residual, findings, and the corrected samples."""
     trials, offered = Trials.of(sample, possible)
+    rule = replace(decisions.ALTERATION, alike=decisions.AGREES) if log else decisions.ALTERATION
     for accepted in trials.accepted(
-        offered, decisions.ALTERATION,
-        lambda one: (len(offered[one]), len(one.joints)),  # number of sizes, and of joints named
-    ):  # fmt: skip
+        offered,
+        rule,
+        lambda one: (len(offered[one]), len(one.joints)),  # of sizes, of joints named
+    ):
         best, size, error = accepted.option, accepted.theta, np.sqrt(np.diag(accepted.covariance))
-        least = best.reading.least * _needed(accepted)
-        if np.linalg.norm(size) < max(least, decisions.SIGNIFICANT * float(np.linalg.norm(error))):
+        least, needed = best.reading.least, _needed(accepted)
+        significant = decisions.SIGNIFICANT * float(np.linalg.norm(error))
+        is_small = float(np.linalg.norm(size)) < max(least * needed, significant)
+        if not least:  # sizes of several units are judged by their torque
+            torque = np.sum((sample.weight * (trials.Z[..., offered[best]] @ size)) ** 2, axis=0)
+            is_small = bool((torque < decisions.MISFIT_MATTERS**2 * sample.torque).all())
+        if is_small or np.isinf(needed):
             return
         corrected = sample
         if best.reading.applied is not None and len(accepted.columns) == len(size):
             applied = partial(best.reading.applied, best.on)
-            size, error, corrected = _refined(applied, size, fit.standard, sample)
+            size, error, corrected = _refined(applied, size, sample.standard, sample)
         others = [(one.reading.code, one.joints) for one in accepted.others if one.joints]
-        unit = "m" if fit.model.layout.prismatic.intersection(best.joints) else "rad"
+        unit = "m" if model.layout.prismatic.intersection(best.joints) else "rad"
         norm, norm_error = float(np.linalg.norm(size)), float(np.linalg.norm(error))
         angle, angle_error = np.degrees(np.arctan([norm, norm_error]))
+        if len(size) == 1 or not least:  # the mass of a load
+            norm, norm_error = float(size[0]), float(error[0])
         explained = finding(
-            best.reading.code, "", best.joints, subject="" if best.joints else "all joints",
-            severity="warning", explained=True, also=bool(others),
+            f"log_differs:{best.reading.code}" if log else best.reading.code, log, best.joints,
+            subject="" if best.joints or log else "all joints", severity="warning", explained=True,
+            also=bool(others), size=norm, std_error=norm_error, share_pct=100 * accepted.share,
             others=listed(f"{x.partition(':')[0]} of {', '.join(joints)}" for x, joints in others),
-            size=float(size[0] if len(size) == 1 else norm), share_pct=100 * accepted.share,
-            std_error=norm_error, angle=angle, angle_error=angle_error, **best.values(size, unit),
+            angle=angle, angle_error=angle_error, **best.values(size, unit),
         )  # fmt: skip
         yield best, explained, corrected
 

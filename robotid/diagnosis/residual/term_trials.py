@@ -108,6 +108,7 @@ class Sample:
     normal: Normal  # of the segments, all joints together
     standard: Array  # (p,), standard parameters of the estimate
     basis: Array | None = None  # as of ``Trajectory.basis``, at these samples
+    share: float = 1.0  # of independent samples
 
     @property
     def fitted(self) -> int:
@@ -183,7 +184,7 @@ def take_sample(fit: Solution, *, for_drives: bool = False, is_free: bool = Fals
         del parts[len(fit.fitted) :]
     rows = [k for _, k in parts]
     own = sum(map(len, rows[: len(fit.fitted)]))
-    segments = _segments(own, sum(map(len, rows)) - own, independent)
+    segments = cut_segments([own, sum(map(len, rows)) - own], independent)
     number = sum(part.stop <= own for part in segments)
     if number < decisions.FEWEST:
         return None
@@ -211,7 +212,8 @@ def take_sample(fit: Solution, *, for_drives: bool = False, is_free: bool = Fals
         at=tuple(motion), taken=tuple(rows), weight=weight,
         torque=np.sum((weight * tau)[:own] ** 2, axis=0), segments=segments, rows=own, W=W,
         r=weight * r, independent=mapping.independent, U=U,
-        normal=Normal.of(W, weight * r, segments, number), standard=fit.standard, basis=basis,
+        share=independent, normal=Normal.of(W, weight * r, segments, number),
+        standard=fit.standard, basis=basis,
     )  # fmt: skip
     return _free(sample, Y[..., mapping.independent]) if is_free else sample
 
@@ -271,10 +273,10 @@ def _spread_rows(
     return rows, min(shares)
 
 
-def _segments(fitted: int, validation: int, independent: float) -> tuple[slice, ...]:
-    """Return the segments of the samples of fitted and of validation recordings."""
+def cut_segments(sizes: Sequence[int], independent: float) -> tuple[slice, ...]:
+    """Return the segments of the samples of several groups of recordings."""
     edges = [0]
-    for rows in (fitted, validation):
+    for rows in sizes:
         enough = max(1, int(rows * independent / decisions.SHORTEST))
         count = min(decisions.SEGMENTS, enough) if rows else 0
         first = edges[-1]

@@ -16,8 +16,7 @@ from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.residual.misfit import Misfit, misfit_finding
 from robotid.diagnosis.urdf.inertials import DENSEST, audit_bodies
 from robotid.diagnosis.verdict.parameter_table import correlated_parameters
-from robotid.diagnosis.verdict.scale_check import friction_shares
-from robotid.diagnosis.verdict.verdict import BEATEN, GOOD, NAMED, SMALL, error_of, is_harmless_cost
+from robotid.diagnosis.verdict.verdict import BEATEN, NAMED, SMALL, is_harmless_cost
 from robotid.estimation.estimators.consistent_fit import slabs
 from robotid.estimation.fitting.estimator_settings import BoundedSettings, ConsistentSettings
 from robotid.estimation.fitting.fitted import CLEARLY, Fit
@@ -429,29 +428,3 @@ def _unlike(name: str, unlike: UnlikeRun, others: int, rest: str) -> Finding:
         size=size, range=span, value=unlike.value, std_error=unlike.std_error, low=low, high=high,
         probability=unlike.probability,
     )  # fmt: skip
-
-
-def rescaled_findings(fit: Fit) -> Iterator[Finding]:
-    """Yield a finding for each torque of a validation log that is a multiple of its prediction."""
-    # The c of least |tau - c tau_predicted| of a poor prediction must remove most of its square.
-    if fit.model.constraints:  # the rows are projected, and mix the joints
-        return
-    friction = dict[str, float]()
-    for e in (e for e in fit.validation if not (e.is_refitted or e.recording.is_partial)):
-        motion, mask = e.recording.trajectory, e.recording.mask
-        log = Path(e.recording.log.path).name
-        for k, joint in enumerate(fit.model.row_names):
-            measured = e.metrics["estimate"].per_joint.get(joint)
-            error = 0.0 if measured is None else error_of(measured)
-            if joint not in fit.model.joints or not GOOD < error < np.inf:
-                continue  # inf: a torque of 0 has no gain
-            tau, predicted = motion.tau[mask[:, k], k], e.torques["estimate"][mask[:, k], k]
-            factor = float(predicted @ tau) / max(float(predicted @ predicted), decisions.NOTHING)
-            left = float(np.sum((tau - factor * predicted) ** 2) / np.sum((tau - predicted) ** 2))
-            if abs(factor - 1.0) < decisions.DIFFERS or left > decisions.BETTER**2:
-                continue
-            friction = friction or friction_shares(fit)
-            yield finding(
-                "gain_change", log, joint, what=friction[joint] > decisions.MOST, factor=factor,
-                share_pct=100 * (1 - left), friction=friction[joint],
-            )  # fmt: skip

@@ -359,7 +359,7 @@ def judge(
     reasons = [
         *predictions.untested(),
         *(caution for one in largest for caution in one.cautions),
-        *predictions.better_by_urdf({w.joint for w in warnings if w.code == "gain_change"}),
+        *predictions.better_by_urdf({w.joint for w in warnings if w.code == "log_differs"}),
         *_described(warnings),
         *(scale if is_far else []),
         *predictions.at_rest(),

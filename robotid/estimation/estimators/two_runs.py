@@ -60,7 +60,7 @@ class TwoRuns:
     share: float  # of independent rows [-]
     unknown: Array  # (u,), int: joints whose gain is unknown
 
-    def compare(self, *, by_joint: bool = True) -> Compared:
+    def compare(self) -> Compared:
         """Fit both runs and the unknown gains together.
 
         Standard errors are from the scatter of the scores of segments and of joints, and at least
@@ -70,7 +70,7 @@ class TwoRuns:
         """
         size, u = len(self.mean), len(self.unknown)
         gain = self._first_gains()
-        theta = self.alike(gain)[0]
+        theta = self._minimum(self._both(gain), self._level(gain))[0]
         for _ in range(_STEPS if u else 1):
             at = theta if u else None
             solution, bread = self._minimum(self._both(gain, at), self._level(gain))
@@ -85,40 +85,10 @@ class TwoRuns:
                 "excitation in both runs, or give some of the gains",
                 "max_iterations",
             )
-        covariance, freedom = self._errors(gain, at, solution, bread, by_joint)
+        covariance, freedom = self._errors(gain, at, solution, bread)
         squares = self._both(gain, at).residual_squares(solution)
         torque = np.maximum(np.abs(gain) * np.sqrt(self._logged.torque_squares()), 1e-300)
         return Compared(theta, gain, covariance, freedom, np.sqrt(squares) / torque)
-
-    def alike(self, gain: Array | None = None) -> tuple[Array, Array]:
-        """Return beta and x for a ``share`` of independent rows: gain (n,) -> (b + d,)."""
-        gain = np.ones(len(self._logged.rows)) if gain is None else gain
-        return self._minimum(self._both(gain), self._level(gain))
-
-    def residual_ratios(self, theta: Array) -> Array:
-        """Return the joint residual of both runs over that of separate fits: (b + d,) -> (n,)."""
-        b = len(self.known)
-        without, loaded = self._whole
-        other = theta[:b] + self.known + self.D @ theta[b:]
-        together = without.residual_squares(theta[:b]) + loaded.residual_squares(other)
-        return np.asarray(together / np.maximum(self._separate_squares, 1e-300))
-
-    def residual_ratios_by_scales(self, free: int) -> Array:
-        """Return these ratios if the runs differ by the scale of torques instead of x."""
-        (without, loaded), size = self._whole, len(self.known)
-        one = np.ones(len(without.rows))
-        beta = self._minimum(self._extended(without, 0, one, None), self._level(one))[0][:size]
-        explained = np.column_stack([self.D[:, :free], beta])
-        end = size + free
-        precision = scipy.linalg.block_diag(self.precision[:end, :end], 1.0)
-        mean = np.append(self.mean[:end], 0.0)
-        scaled = replace(self, D=explained, mean=mean, precision=precision)
-        left = without.residual_squares(beta)
-        for j, (R, columns) in enumerate(zip(loaded.triangles, loaded.columns, strict=True)):
-            A = R[:, :-1] @ explained[columns]
-            left[j] += np.sum((R[:, -1] - A @ np.linalg.lstsq(A, R[:, -1], rcond=None)[0]) ** 2)
-        by_joint: Array = left / np.maximum(self._separate_squares, 1e-300)
-        return min(scaled.residual_ratios(scaled.compare().theta), by_joint, key=np.mean)
 
     def _level(self, gain: Array) -> Array:
         """Return noise levels for rows treated as independent, shape (n,) [N m or N]."""
@@ -135,18 +105,13 @@ class TwoRuns:
         return merge(self._whole)
 
     @cached_property
-    def _separate_squares(self) -> Array:
-        """Residual sums of squares of separate fits for each joint and run, shape (n,)."""
-        squares = [[R[-1, -1] ** 2 for R in run.triangles] for run in self._whole]
-        return np.asarray(np.sum(squares, axis=0))
-
-    @cached_property
     def _noise(self) -> Array:
         """Noise level of each joint's signal from separate fits of the runs, shape (n,), above 0.
 
         A joint that moves in a few rows only has its RMS signal, rows projected together one level.
         """
-        rows, squares = np.maximum(self._logged.rows, 1), self._separate_squares
+        rows, separate = np.maximum(self._logged.rows, 1), [run.triangles for run in self._whole]
+        squares: Array = np.sum([[R[-1, -1] ** 2 for R in run] for run in separate], axis=0)
         used = np.array([len(columns) for columns in self._logged.columns])
         torque = self._logged.torque_squares()
         if self._logged.is_projected:
@@ -219,7 +184,7 @@ class TwoRuns:
         return inverse @ R[:-1, -1], inverse @ inverse.T
 
     def _errors(
-        self, gain: Array, at: Array | None, solution: Array, bread: Array, by_joint: bool
+        self, gain: Array, at: Array | None, solution: Array, bread: Array
     ) -> tuple[Array, Array]:
         """Return covariance and degrees of freedom, including the uncertainty of the prior.
 
@@ -235,7 +200,7 @@ class TwoRuns:
         both = [self._extended(run, loaded, gain, at) for loaded, run in enumerate(self._whole)]
         joints = [_of_joint(run, j) for run in both for j in range(len(gain))]
         is_alone = not self._logged.is_projected  # else the rows of joints are mixed
-        if by_joint and is_alone and len(joints) >= FEWEST_SEGMENTS:
+        if is_alone and len(joints) >= FEWEST_SEGMENTS:
             other, few = self._scattered(joints, gain, solution, bread)
             freedom = np.where(np.diag(other) > np.diag(covariance), few, freedom)
             covariance = at_least(covariance, np.diag(other))

@@ -125,7 +125,7 @@ class JointMotion:
         none, far, m = np.zeros_like(motion.v), np.full_like(motion.v, np.inf), motion
         return cls(m.q, m.v, m.a, m.direction, m.load, travelled=far, time=none)
 
-    def at(self, rows: slice) -> "JointMotion":
+    def at(self, rows: slice | Array) -> "JointMotion":
         """Return the motion in some of the rows, without the other joints."""
         names = ("q", "v", "a", "direction", "load", "travelled", "time")
         some: dict[str, Any] = {name: getattr(self, name)[rows] for name in names}

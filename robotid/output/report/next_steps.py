@@ -198,7 +198,7 @@ def _once(steps: Sequence[Step]) -> tuple[Step, ...]:
 def _of_verdict(found: TorqueIdentification) -> list[Cause]:
     causes, predictions = [], found.predictions
     measured = [(j, m) for metrics in predictions.values() for j, m in metrics.per_joint.items()]
-    rescaled = {joint for f in found.findings if f.code == "gain_change" for joint in f.joints}
+    rescaled = {joint for f in found.findings if f.code == "log_differs" for joint in f.joints}
     beaten = {joint for joint, m in measured if is_beaten(m)} - rescaled
     poor = {j for j, m in measured if m.relative_error_pct and m.relative_error_pct > GOOD}
     for code, joints in (("beaten", beaten), ("poor_prediction", poor)):
@@ -308,17 +308,6 @@ def _terms(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause])
     return _step(name, origin, (*blocks, *again), joints=_named(causes), what=what)
 
 
-def _payload(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    logs = [x for x in found.validation if not x.is_refitted] or list(found.fitted)
-    log, urdf = str(logs[0].recording.log.path), str(found.model.tree.path)
-    words: tuple[str, ...] = (urdf, log, "--reference", f"{origin.folder}/result.json")
-    if all(f.evidence.get("mass", 0.0) < 0 for cause in causes for f in cause.findings):
-        # the fitted log carries the payload
-        gains = [x for pair in _gain_flags(origin) for x in ("--gain", "=".join(pair))]
-        words = (urdf, str(found.fitted[0].recording.log.path), "--reference", log, *gains)
-    return _step("payload", origin, origin.using("payload", *words))
-
-
 def _as_found(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     return Step(" ".join(f"{sentence_of(m)}." for cause in causes for m in cause.messages[:1]))
 
@@ -387,7 +376,7 @@ def _replay(found: Identification, origin: Origin) -> tuple[str, ...]:
 #: The steps, the most informative first, by the name that the catalogue of findings gives them.
 _STEPS: Mapping[str, Callable[[TorqueIdentification, Origin, Sequence[Cause]], Step]] = {
     "doctor": _doctor, "scale": _scale, "gains": _gains, "delay": partial(_plain, "delay"),
-    "locks": _locks, "zeros": partial(_plain, "zeros"), "payload": _payload,
+    "locks": _locks, "zeros": partial(_plain, "zeros"),
     "unclipped": partial(_plain, "unclipped"), "terms": _terms, "as_found": _as_found,
     "validate": partial(_plain, "validate"), "possible": partial(_plain, "possible"),
     "watch": _watch, "pin": partial(_plain, "pin"), "richer": partial(_plain, "richer"),

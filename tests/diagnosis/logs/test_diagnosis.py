@@ -271,10 +271,6 @@ def test_ur10e_carries_a_load_and_moves_one_joint_at_a_time(recordings, monkeypa
     assert loaded.severity == "warning"
     assert loaded.evidence["mass"] == pytest.approx(2.805, abs=3 * loaded.evidence["std_error"])
     assert "ident_20200219_14harm.parquet" not in payload
-    (change,) = [f for f in findings if f.code == "payload_change"]
-    # 2.805 kg; the stated gains make it 9 % more, as `robotid payload` weighs it
-    assert change.evidence["mass"] == pytest.approx(-3.06, abs=3 * change.evidence["std_error"])
-    assert change.evidence["std_error"] < 0.05
     assert "repeated_motion" in loud(findings)  # the same motion with and without the load
     single = examine(whole(recordings, monkeypatch, "ur10e", "jointwise_2"))
     still = {f.where.split(": ")[1] for f in single if f.code in ("static_joint", "hardly_moves")}

@@ -277,7 +277,7 @@ def test_a_finding_of_the_fit_is_a_note_while_a_reading_of_its_joints_stands():
     assert said(doctor_finding("torque_sign", PAN), *terms, ignore=("torque_sign",)) == "ewww"
     assert said(doctor_finding("torque_delay", "", "warning"), *terms) == "wnnn"
     # what names no cause explains nothing, and a finding of a validation log rests on the fit
-    gain = doctor_finding("gain_change", LIFT, "warning", "b.csv")
+    gain = doctor_finding("log_differs", LIFT, "warning", "b.csv")
     assert said(doctor_finding("unexplained_torque", PAN, "warning"), terms[0], gain) == "wwn"
     assert said(doctor_finding("urdf_mismatch"), doctor_finding("joint_axis", PAN)) == "e"
     # of one channel: the columns are exchanged, or it has another unit and its sign is no evidence

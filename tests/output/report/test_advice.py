@@ -73,7 +73,6 @@ NAMED = {
     "drift": "Drift is so; do something",
     "friction_shape": "Add the missing drive terms",
     "load_friction": "Add the missing drive terms",
-    "payload_change": "Validate with the payload",
     "position_offset": "Correct the position offset",
     "position_periodic": "Add the missing drive terms",
     "spring": "Add the missing drive terms",
