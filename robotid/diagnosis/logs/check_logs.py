@@ -121,7 +121,6 @@ def _examine_log(model: RobotModel, log: Log, signals: SignalSettings) -> _Exami
     one.probe = take_probe(model, one.motion)
     if one.probe is None:
         findings.append(finding("no_motion", name))
-        return one
     codes = {x.code for x in findings if x.severity == "error"}
     one.is_tried = codes.isdisjoint(_FIT_NO_MODEL)
     return one

@@ -25,6 +25,7 @@ _SCALES = np.logspace(-3, 3, 61)
 _WRONG_TILT = 30.0  # [deg] angle of gravity from the stated one that is an error
 _LARGE = 0.08  # payload over the arm's mass that errors of the links do not explain
 _MISMATCH = 7.5  # largest sum of squared errors of the links, in standard deviations
+_ORDERS = ("torque_order", "position_order", "joint_order")
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,9 +115,6 @@ def _findings(samples: Samples, found: Sequence[Best], log: str) -> Iterator[Fin
             gain=sum(one.gain for one in pairs), unexplained=pairs[0].before.max(),
             unexplained_so_read=pairs[-1].after.max(),
         )  # fmt: skip
-
-
-_ORDERS = ("torque_order", "position_order", "joint_order")
 
 
 def _finding(samples: Samples, one: Best, log: str) -> Finding:

@@ -207,14 +207,13 @@ class _Alteration:
         """Return the values of the finding for sizes (c,)."""
         joint, is_one = "".join(self.joints[:1]), len(self.joints) == 1
         sense = "one" if is_one else "more" if x[0] > 0 else "less"
+        position = f"q_{joint}" if joint else "every position"
         residual: dict[str, float | str] = {"what": "residual", "cure": "residual"}
         factor: dict[str, float | str] = {"factor": 1 + x[0]}
         values: dict[str, dict[str, float | str]] = {
             "position_offset": {"correction": -x[0], "unit": unit},
             "lost_motion": {"unit": unit},
-            "angle_scale": factor
-            | residual
-            | {"named": f"q_{joint}" if joint else "every position"},
+            "angle_scale": factor | residual | {"named": position},
             "torque_scale": factor | {"what": sense, "cure": sense},
             "time_scale": factor | residual | {"speed": np.sqrt(max(1 + x[0], 0.0))},
             "joint_origin": {"named": joint or "a joint"},
@@ -401,11 +400,9 @@ def _accepted(
     """Yield the alterations that explain the residual, findings, and the corrected samples."""
     trials, offered = Trials.of(sample, possible)
     rule = replace(decisions.ALTERATION, alike=decisions.AGREES) if log else decisions.ALTERATION
-    for accepted in trials.accepted(
-        offered,
-        rule,
-        lambda one: (len(offered[one]), len(one.joints)),  # of sizes, of joints named
-    ):
+    # the simplest of those alike has the fewest sizes, then joints
+    series = trials.accepted(offered, rule, lambda one: (len(offered[one]), len(one.joints)))
+    for accepted in series:
         best, size, error = accepted.option, accepted.theta, np.sqrt(np.diag(accepted.covariance))
         least, needed = best.reading.least, _needed(accepted)
         significant = decisions.SIGNIFICANT * float(np.linalg.norm(error))

@@ -35,7 +35,8 @@ def with_model_error(
     motions = _motions(fit, sample) if fit.drives else []
     fit = _wider(fit, sample, list(_of_shapes(fit, sample, motions)))
     fit = _wider(fit, sample, list(_of_undecided(fit, sample, motions)))
-    lacking = [_Move(m.joint, m.shift, partial(_of_misfit, m)) for m in misfits]
+    torques = [partial(lambda m, _, alone: m.torque(alone), misfit) for misfit in misfits]
+    lacking = [_Move(m.joint, m.shift, torque) for m, torque in zip(misfits, torques, strict=True)]
     wider = _wider(fit, sample, lacking)
     before, after = fit.standard_error, wider.standard_error
     drives = np.arange(len(before)) >= fit.model.layout.n_inertial
@@ -79,11 +80,6 @@ def _of_shapes(fit: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> Iter
             for axis in (axes * np.sqrt(np.maximum(variance, 0.0))).T:
                 torque = partial(_shape_change, fit, choice, axis)
                 yield _Move(choice.joint, -(T @ axis), torque)
-
-
-def _of_misfit(misfit: Misfit, motion: DriveMotion, alone: JointMotion) -> Array:
-    """Return the torque of a term that the model lacks, shape (N,)."""
-    return misfit.torque(alone)
 
 
 def _shape_change(
