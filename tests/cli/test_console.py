@@ -64,7 +64,7 @@ def test_a_terminal_shows_stages_then_lines_that_fit_and_a_tinted_verdict(arm_lo
     # paths and commands, which are copied, are not broken
     assert all(str(arm_logs) in line or ARM in line for line in long), long
     assert len(lines) > 30
-    assert "  in wider terminals: gravity only %" in lines
+    assert "  in wider terminals: URDF %, gravity only %" in lines
 
 
 def test_a_result_names_recordings_with_their_windows_and_commands_that_work(arm_logs, capsys):

@@ -109,11 +109,11 @@ class Identified(ABC):
     def standard_interval(self) -> Array:
         """95 % interval of each standard parameter, shape (p, 2); infinite if there is none."""
         # of a consistent fit, none contains a negative mass, moment of inertia or friction
-        half, layout = self.standard_quantile * self.standard_error, self.model.layout
+        half = self.standard_quantile * self.standard_error
         low = self.standard - half
         if self.is_consistent:
-            is_size = [x.endswith((".m", ".Ixx", ".Iyy", ".Izz")) for x in layout.names]
-            bounded = np.isfinite(half) & (is_size | layout.is_nonnegative())
+            is_size = [x.endswith((".m", ".Ixx", ".Iyy", ".Izz")) for x in self.model.layout.names]
+            bounded = np.isfinite(half) & (is_size | self.model.layout.is_nonnegative())
             low = np.where(bounded, np.maximum(low, 0.0), low)
         return np.column_stack([low, self.standard + half])
 

@@ -61,6 +61,7 @@ def test_intervals_are_each_value_s_own_quantile_times_its_own_error():
     half = {"base_quantile": np.array([2.0, 3.0]), "base_error": np.array([0.5, 0.25])}
     half |= {"standard_quantile": np.array([4.0, 1.5]), "standard_error": np.array([0.5, np.inf])}
     found = SimpleNamespace(base=np.array([1.0, -2.0]), standard=np.array([7.0, 5.0]), **half)
+    found.is_consistent = False
     assert Fit.base_interval.fget(found).tolist() == [[0.0, 2.0], [-2.75, -1.25]]
     assert Fit.standard_interval.fget(found).tolist() == [[5.0, 9.0], [-np.inf, np.inf]]
 
