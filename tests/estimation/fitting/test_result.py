@@ -64,6 +64,10 @@ def test_intervals_are_each_value_s_own_quantile_times_its_own_error():
     found.is_consistent = False
     assert Fit.base_interval.fget(found).tolist() == [[0.0, 2.0], [-2.75, -1.25]]
     assert Fit.standard_interval.fget(found).tolist() == [[5.0, 9.0], [-np.inf, np.inf]]
+    layout = SimpleNamespace(names=("a.m", "a.mcx"), is_nonnegative=lambda: np.zeros(2, bool))
+    found.is_consistent, found.model = True, SimpleNamespace(layout=layout)
+    found.standard_error = np.array([2.0, 4.0])
+    assert Fit.standard_interval.fget(found).tolist() == [[0.0, 15.0], [-1.0, 11.0]], "a mass"
 
 
 def test_wls_is_overfitted_where_it_predicts_every_unseen_log_by_a_fifth_worse(identified):
