@@ -167,8 +167,7 @@ class LoadModel:
 
     def misfit(self, scale: float | Array) -> float:
         """Return the misfit of torques times a scale, or (n,): chi-square, prior included."""
-        R = np.asarray(np.linalg.qr(self._rows(scale), mode="r"))
-        return float(R[-1, -1] ** 2)
+        return float(np.asarray(np.linalg.qr(self._rows(scale), mode="r"))[-1, -1] ** 2)
 
     def fit(self, scale: float = 1.0) -> tuple[float, Array, Array]:
         """Fit with the torque columns multiplied by a scale, without negative masses of links."""

@@ -133,6 +133,7 @@ def _of_robot(
     least = 0.02 * float(np.linalg.norm(GRAVITY)) * pi[: model.layout.n_inertial : 10].sum()
     return (
         Reading("gravity", 0.025, level, lambda on: by.by_gravity @ across.T, tilted),
+        Reading("moving_gravity", 0.025, level, lambda on: g * by.by_gravity, changes=True),
         Reading("moving_gravity", 0.025, level, weighed, changes=True),
         Reading("external_force", least, every, push),
         Reading("external_force", least, every, push, changes=True),
