@@ -381,9 +381,8 @@ def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
         shifted = Reading("position_offset", (j,), partial(_shifted, on=place[j]), (), 0.1)
         if m.basis is not None:
             yield from shifted.started(samples)
-            yield from Reading("angle_scale", (j,), partial(_multiplied, j=j), (), 0.1).started(
-                samples
-            )
+            scaled = Reading("angle_scale", (j,), partial(_multiplied, j=j), (), 0.1)
+            yield from scaled.started(samples)
         else:
             for offset in (np.pi / 2, -np.pi / 2, np.pi, _OFFSET, -_OFFSET):
                 yield replace(shifted, values=(offset,))

@@ -127,8 +127,8 @@ def fit_loops(
         simulator = replace(simulator, windows=_few(every, 4 * _FEW))
     if len(simulator.windows) < len(every):
         _log.warning(
-            "%.0f s of logs are simulated in each step of the fit: 1 to 2 s of processor time for "
-            "each second. To be faster, select parts with start and end",
+            "%.0f s of logs are simulated in each step of the fit, which takes minutes: to be "
+            "faster, select parts with start and end",
             sum(np.ptp(log.t) for log in logs),
         )
     for left in reversed(range(_STARTS)):
