@@ -175,7 +175,7 @@ warning: clipped: first.csv: the torque of elbow_joint is at its limit -20 in
 The tables state the typical severity; it depends on the figures and on the use of a channel. Words in italics are figures and names, which `--json` prints, too.
 
 - `robotid inspect` reports errors of a URDF. In `robotid identify` they are warnings, and the nearest possible body is used.
-- `--verbose` adds the notes. `robotid identify` has the doctor's errors and warnings, and all findings of the fit: `result.json` has them under [`warnings`](../result_files.md).
+- `--verbose` adds the notes. `result.json` has the errors, warnings and findings of the fit under [`warnings`](../result_files.md).
 - If you know that a finding is wrong, `ignore = ["urdf_mismatch"]` under `[doctor]` (`--ignore CODE`) removes its effect on the verdict. Only errors and warnings that
   limit the verdict can be ignored.
 
