@@ -154,11 +154,8 @@ def test_a_motion_that_swings_between_the_first_samples_is_followed_by_its_accel
 
         def evaluate(self, t):
             w, none = np.pi / h, np.zeros_like(t)
-            x, v, a = (
-                -0.1 + 0.2 * np.cos(w * t),
-                -0.2 * w * np.sin(w * t),
-                -0.2 * w**2 * np.cos(w * t),
-            )
+            x, v = -0.1 + 0.2 * np.cos(w * t), -0.2 * w * np.sin(w * t)
+            a = -0.2 * w**2 * np.cos(w * t)
             return tuple(np.column_stack([y, none]) for y in (x, v, a))
 
     contact = clearance.nearest(Swing(), 20 * h)

@@ -64,7 +64,7 @@ def examine_base(
         motion = process(log, still)
         wrong = list(check_order(model, log, motion))
         whole = log if wrong else with_contacts(model, log, signals)
-        motion, smooth = process(whole, still), process(whole, signals)
+        motion = process(whole, still)
     except DataError:  # too short, or no contacts: raised again when the log is read
         return findings + twist, None
     if wrong:
@@ -78,7 +78,7 @@ def examine_base(
     if not wrong:
         findings += check_wrenches(model, log.name, motion)
     findings += _check_feet(model, log, whole, motion)
-    return findings, smooth
+    return findings, motion
 
 
 def check_wrenches(model: RobotModel, log: str, motion: Trajectory) -> Iterator[Finding]:

@@ -47,10 +47,8 @@ def fitted(model, logs, estimator=SETTINGS):
 
 def found(model, change, robot="ur5_robot.urdf", turn=None, duration=16.0, estimator=None):
     """Return the findings on logs of a robot near its URDF that a change spoilt alike."""
-    arm, logs = (
-        build(replace(ROBOTS["ur5"], urdf=str(robot), joints=model.joints), (3,), turn=turn),
-        [],
-    )
+    arm = build(replace(ROBOTS["ur5"], urdf=str(robot), joints=model.joints), (3,), turn=turn)
+    logs = []
     for part in (0, 1):
         run = move(arm.model, np.random.default_rng([3, part]), 50.0, duration)
         run = replace(run, tau=arm.rigid(run) + arm.drives(run))
@@ -254,11 +252,8 @@ def test_a_base_that_is_off_the_level_by_two_degrees_is_named(model):
 def disturbed(model, log, force, gravity=lambda t: 0.0 * t):
     """Return a log with a force (3,) on the flange, and with gravity turned about the x axis."""
     engine, tau = model.pin_model.copy(), log.tau.copy()
-    data, tip, down = (
-        engine.createData(),
-        engine.getFrameId("ee_link"),
-        np.array(engine.gravity.linear),
-    )
+    data, tip = engine.createData(), engine.getFrameId("ee_link")
+    down = np.array(engine.gravity.linear)
     for k, (t, q) in enumerate(zip(log.t, log.q, strict=True)):
         J = pin.computeFrameJacobian(engine, data, q, tip, pin.LOCAL_WORLD_ALIGNED)
         engine.gravity.linear = down

@@ -313,6 +313,14 @@ def test_planted_terms_are_selected_and_no_others(fit):
             assert shape.std_error < 0.02
 
 
+def test_errors_of_shapes_do_not_depend_on_the_order_of_the_families(fit):
+    errors = []
+    for families in (("stribeck", "power"), ("power", "stribeck")):
+        choices = choose_drives(fit, wanted(fit, "FL_HFE", families=families))
+        errors += [{x.name: x.std_error for x in c.shapes} for c in choices if c.families]
+    assert errors[0] == pytest.approx(errors[1], rel=0.02)
+
+
 def test_the_row_of_a_joint_alone_has_all_of_its_projected_torque(fit, rng):
     """Row j over sqrt(P_jj) has the same products with the regressor as all rows together."""
     sample = take_sample(fit, for_drives=True)

@@ -21,10 +21,8 @@ def inside(rng):
     """A fit whose prior is so narrow and so far inside that no bound binds."""
     model = arm()
     trajectory = process(exact_log(model, truth(model), rng), EXACT)
-    prior, spread = (
-        model.standard_parameters(),
-        1e-3 * prior_spread(model, trajectory.squares, len(trajectory.t)),
-    )
+    prior = model.standard_parameters()
+    spread = 1e-3 * prior_spread(model, trajectory.squares, len(trajectory.t))
     prior[model.layout.n_inertial :] = 100.0 * spread[model.layout.n_inertial :]
     K = structural_mapping(model).K
     return Consistent(model.layout, K, prior, spread)

@@ -71,7 +71,7 @@ def test_speeds_that_are_better_than_positions_make_it_surer(leg):
 def test_the_time_of_a_long_fit_is_stated_before_it_begins(leg, monkeypatch, caplog):
     monkeypatch.setattr(stages, "_FEW", 1)  # long: more than eight windows
     fitted(leg, window=0.25, lead=0.05)
-    assert caplog.messages[0].startswith("2 s of logs are simulated in each step of the fit: 1 to")
+    assert "2 s of logs are simulated in each step of the fit, which takes minutes" in caplog.text
 
 
 def test_velocities_that_are_not_those_of_the_positions_are_refused(leg):

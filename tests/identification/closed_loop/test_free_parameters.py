@@ -222,10 +222,8 @@ def noisy_windows(rng):
     t = np.arange(750) / 250.0
     q_ref = multisine(t, arm.middle, arm.reach, rng)
     log = Log(t, q_ref, 0 * q_ref, arm.model.joints, q_ref=q_ref, has_torque=False)
-    robot, loops = (
-        ClosedLoopRobot(arm.model, step=4e-3),
-        loops_of(arm.model, arm.parameters, arm.drives),
-    )
+    robot = ClosedLoopRobot(arm.model, step=4e-3)
+    loops = loops_of(arm.model, arm.parameters, arm.drives)
     [out] = robot.roll_out(loops, cut_windows(log, np.inf, 0.0))
     noisy = replace(log, q=out.q + 3e-4 * rng.standard_normal(out.q.shape))
     unknown = FreeParameter("delay", "delay", (0, 1), 0.006, 0.1)
