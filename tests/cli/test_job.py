@@ -5,6 +5,7 @@ import pytest
 from robotid.base.exceptions import SettingsError
 from robotid.cli.job import Job, job_from_settings, read_job
 from robotid.data.signal_settings import LogSource
+from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.robot.constraints import Loop
 from robotid.robot.parameters import Coupling
 
@@ -163,6 +164,8 @@ WRONG = {
                  "a [[transmission]] has no key 'joints'"),
     "term in lists": ("[estimator]", "[drives]\nj1 = [[]]\n[estimator]",
                       "a drive term is [], expected a table, for example { term = 'Stribeck'"),
+    "gains of a log": ("start = 0.3", "controller = { kp = 2.0 }", "[controller] is given, but"),
+    "gain of a log": ("start = 0.3", "controller = { ki = 2.0 }", "controller.ki is not a known"),
     "group": ('"wls"', '"simulation"\n[controller]\ngroups = { a = "j1" }',
               "groups.a is 'j1', expected a list"),
     "step": ('"wls"', '"simulation"\nstep = 1e-9', "step is 1e-09, expected 2e-5 to 0.1"),
@@ -204,6 +207,21 @@ def test_a_controller_that_the_estimator_does_not_read_is_refused(tmp_path):
     job = job_from_settings(table, "job.toml", tmp_path)
     assert job.controller.kp == 20.0
     assert job.to_dict()["controller"]["kp"] == 20.0
+    entry = {"log": "a.csv", "controller": {"kp": {"b": 60.0}, "kd": 0.8}}
+    own = job_from_settings(table | {"identification": [entry]}, "job.toml", tmp_path)
+    assert own.to_dict()["identification"][0]["controller"] == entry["controller"]
+    gains = own.identification[0].controller
+    assert gains.factors(own.controller, ("a", "b")).tolist() == [[1.0, 3.0], [0.8, 0.8]]
+    with pytest.raises(SettingsError, match=r"kp is given for 'b', which is not a moving joint: a"):
+        gains.factors(own.controller, ("a",))
+    for common, has in (
+        (LoopSettings(kd=0.0), "kd = 0"),
+        (LoopSettings("torque"), "kind 'torque'"),
+    ):
+        with pytest.raises(
+            SettingsError, match=rf"\[controller\] has {has}, which no gain of a log"
+        ):
+            gains.factors(common, ("a", "b"))
     del table["controller"]
     assert "controller" not in job_from_settings(table, "job.toml", tmp_path).to_dict()
 

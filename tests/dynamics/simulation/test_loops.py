@@ -243,7 +243,8 @@ def differences(robot, loops, windows, change, h):
 )
 def test_sensitivities_are_those_of_differences(request, name, rate, terms):
     model = request.getfixturevalue(name)
-    robot, windows = ClosedLoopRobot(model), cut_windows(commanded(model, 0.12), np.inf, 0.0)
+    log = replace(commanded(model, 0.12), gain_factors=np.array([[1.1], [0.8]]))
+    robot, windows = ClosedLoopRobot(model), cut_windows(log, np.inf, 0.0)
     size = 1.0 if name == "legs" else 30.0
     n, kinds = len(model.joints), robot.kinds
     values = VALUES if terms is TERMS else (0.1, 0.05, 0.1, 0.15, 0.1)
@@ -426,7 +427,9 @@ def test_sensitivities_by_the_start_are_those_of_differences(legs, rate):
 
 def test_lanes_know_nothing_of_each_other(legs):
     log = commanded(legs, 0.5)
-    robot, windows = ClosedLoopRobot(legs), cut_windows(log, 0.042, 0.01)
+    stiff = replace(log, gain_factors=np.array([[2.0], [1.4]]))
+    robot = ClosedLoopRobot(legs)
+    windows = [w for x in (log, stiff, log) for w in cut_windows(x, 0.042, 0.01)]
     assert len(windows) > 8, "more than a block of lanes"
     column = [(robot.kinds["kp"], 4, 0)]
     together = robot.roll_out(loops_of(legs), windows, column)

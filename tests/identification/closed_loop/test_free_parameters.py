@@ -105,8 +105,8 @@ def test_slopes_of_residuals_are_those_of_differences(simulator, rng, compared):
         size = np.repeat(size.reshape(-1, 3).max(axis=1), 3)  # of positions, speeds, torques
         assert (np.abs(slopes[..., k] - exact).max(axis=0) <= close * size).all(), name
     if compared == "all":
-        rolled = zip(simulator.roll_out(theta), plain, strict=True)
-        logged = [out.window.log.tau[out.window.counted] - r.e[:, 6:] for out, r in rolled]
+        both = zip(simulator.windows, plain, strict=True)
+        logged = [w.log.tau[w.counted] - r.e[:, 6:] for w, r in both]
         given = np.concatenate(logged)
         at_limit = np.isclose(np.abs(given), 0.3)
         assert 0.02 < at_limit[:, 1:].mean() < 0.9, "drives are at their limit, and are not"
