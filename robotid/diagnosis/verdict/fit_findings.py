@@ -15,11 +15,10 @@ from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.residual.misfit import Misfit, misfit_finding
 from robotid.diagnosis.urdf.inertials import DENSEST, audit_bodies
-from robotid.diagnosis.verdict.parameter_table import correlated_parameters
 from robotid.diagnosis.verdict.verdict import BEATEN, NAMED, SMALL, is_harmless_cost
 from robotid.estimation.estimators.consistent_fit import slabs
 from robotid.estimation.fitting.estimator_settings import BoundedSettings, ConsistentSettings
-from robotid.estimation.fitting.fitted import CLEARLY, Fit
+from robotid.estimation.fitting.fitted import CLEARLY, Fit, Identified
 from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.estimation.variation.variation import UnlikeRun, Variation
 from robotid.robot.bodies import (
@@ -168,6 +167,33 @@ def correlated_findings(fit: Fit) -> Iterator[Finding]:
                 "correlated_terms", "", choice.joint, what="grown", name=name,
                 families=listed(choice.families), grown=choice.grown[name],
             )  # fmt: skip
+
+
+def _correlations(C: Array, own: Sequence[int]) -> Array:
+    """Return the correlations of parameters with each other, 0 of each with itself."""
+    error = np.sqrt(np.diag(C)[own])
+    return np.asarray(C[np.ix_(own, own)] / np.outer(error, error) - np.eye(len(own)))
+
+
+def correlated_sets(C: Array, own: Sequence[int]) -> list[list[int]]:
+    """Return the sets of parameters that strong correlations connect: C (p, p)."""
+    groups = decisions.connected(np.abs(_correlations(C, own)) > decisions.CORRELATED)
+    return [[own[k] for k in group] for group in groups]
+
+
+def correlated_parameters(fit: Identified) -> dict[int, tuple[int, float]]:
+    """Return drive parameters strongly correlated with another parameter of the same drive."""
+    layout, C, at_bound = fit.model.layout, fit.standard_covariance, fit.at_bound
+    pairs = {}
+    drive_of = enumerate([d for d, _ in layout.drive_parameters], start=layout.n_inertial)
+    used = [(k, drive) for k, drive in drive_of if C[k, k] > 0 and not at_bound[k]]
+    for drive in range(len(layout.drives)):
+        own = [k for k, of_drive in used if of_drive == drive]
+        for i, row in zip(own, _correlations(C, own), strict=True):
+            k = int(np.argmax(np.abs(row)))
+            if abs(row[k]) > decisions.CORRELATED:
+                pairs[i] = own[k], float(row[k])
+    return pairs
 
 
 def not_written(log_errors: Sequence[Finding], inconsistent: str = "") -> Iterator[Finding]:

@@ -19,7 +19,6 @@ from robotid.base.versions import __version__
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.decisions import LEAST_SHARE
 from robotid.diagnosis.residual.torque_split import JointTorque, friction_split
-from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.diagnosis.verdict.verdict import uses_line
 from robotid.estimation.fitting.evaluation import Evaluated, Evaluation
 from robotid.estimation.fitting.fitted import next_errors
@@ -28,6 +27,7 @@ from robotid.identification.closed_loop.position_errors import (
     PositionEvaluation,
     pool_positions,
 )
+from robotid.identification.parameter_table import parameter_entries
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.identification.summary import left_out_lines
 from robotid.output.files.entries import loop_parameters
