@@ -9,8 +9,8 @@ from typing import Any
 from robotid.base.findings import Finding
 from robotid.base.settings import Settings
 from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.residual.joint_torques import JointTorque, joint_torques
 from robotid.diagnosis.residual.misfit import Misfit
-from robotid.diagnosis.residual.torque_split import JointTorque, joint_torques
 from robotid.diagnosis.verdict.scale_check import PayloadCheck, ScaleCheck, check_scale
 from robotid.diagnosis.verdict.verdict import (
     Determined,

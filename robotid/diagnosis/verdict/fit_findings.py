@@ -25,7 +25,6 @@ from robotid.robot.bodies import (
     body_boxes,
     body_points,
     density_share,
-    held_parameters,
     least_density,
     negligible_bodies,
 )
@@ -77,7 +76,7 @@ def fit_findings(
 def _costs(fit: Fit) -> Iterator[Finding]:
     """Yield the joints whose torque error the constraints increase."""
     # A note if they add little, sqrt(error^2 - wls^2), unless stated; or if WLS predicts worse.
-    wls, settings, locked = fit.metrics("wls").per_joint, fit.estimator, _locked_links(fit)
+    wls, settings = fit.metrics("wls").per_joint, fit.estimator
     asked = ""  # the constraints that the user states
     if isinstance(settings, BoundedSettings) and any(settings.constraints.values()):
         keys = listed(key for key, value in settings.constraints.items() if value)
@@ -88,12 +87,12 @@ def _costs(fit: Fit) -> Iterator[Finding]:
             continue
         error, least = measured.relative_error_pct, free.relative_error_pct or 0.0
         is_little = error is not None and error**2 - least**2 < SMALL**2
-        is_little = is_little and is_harmless_cost(error or 0.0, least) and not (asked or locked)
+        is_little = is_little and is_harmless_cost(error or 0.0, least) and not asked
         what = "overfitted" if joint in fit.overfitted else "costly"
         what = "little" if is_little else what
         yield finding(
             "constraint_costs", "", joint, severity="warning" if what == "costly" else "note",
-            what=what, cure=what, asked=asked, locked=locked, unit=measured.unit,
+            what=what, cure=what, asked=asked, unit=measured.unit,
             error_pct=error or 0.0, wls_error_pct=least, rmse=measured.rmse, wls_rmse=free.rmse,
         )  # fmt: skip
 
@@ -215,18 +214,13 @@ def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]
 
 def _in_line(model: RobotModel) -> set[str]:
     """Return the joints that carry an identified joint, or are carried by one."""
-    above = {joint.child: joint for joint in model.tree.joints}
-    carriers: dict[str, set[str]] = {joint.name: set() for joint in model.tree.joints}
-    for joint in model.tree.joints:
-        link = joint.parent
-        while link in above:
-            carriers[joint.name].add(above[link].name)
-            link = above[link].parent
-    identified = set(model.joints)
+    carriers, identified = model.tree.carriers, set(model.joints)
     carrying = set[str]().union(*(carriers[name] for name in identified))
     # the position of a base changes no torque, only its orientation
     rotating = {joint.name for joint in model.tree.joints if joint.type != "prismatic"}
-    return carrying & rotating | {name for name, own in carriers.items() if own & identified}
+    return carrying & rotating | {
+        name for name, above in carriers.items() if identified.intersection(above)
+    }
 
 
 def log_findings(logs: Sequence[Log]) -> Iterator[Finding]:
@@ -391,25 +385,6 @@ def _of_outliers(fit: Fit) -> Finding:
         count=f"{len(outliers)} outlier{'s' * (len(outliers) > 1)}", places=len(outliers),
         largest=outliers[0].size,
     )  # fmt: skip
-
-
-def _locked_links(fit: Fit) -> str:
-    """Return the bodies that links on locked joints make barely possible, as text."""
-    # Such links keep the URDF's inertials: the moved link takes all their errors.
-    model, size = fit.model, fit.model.layout.n_inertial
-    held, identified = held_parameters(model), fit.standard[:size]
-    own, before = (
-        np.linalg.eigvalsh(pseudo_inertia(pi[:size] - held))[:, 0]
-        for pi in (identified, model.standard_parameters())
-    )
-    is_shrunk = own < decisions.DIFFERS * before
-    is_shrunk &= held[::10] > decisions.DIFFERS * identified[::10]
-    return "".join(
-        f"the URDF's inertials of the links on locked joints, {held[10 * k]:.3g} kg of the "
-        f"{identified[10 * k]:.3g} kg of {model.layout.bodies[k]} (identify their joints, too, if "
-        "they are wrong), "
-        for k in np.flatnonzero(is_shrunk)
-    )
 
 
 def _contradiction(fit: Fit) -> tuple[str, dict[str, str]]:

@@ -11,7 +11,13 @@ from helpers.synthetic import exact_log, truth
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs import torque_delay
 from robotid.diagnosis.logs.check_logs import diagnose
-from robotid.diagnosis.logs.probe import Probe, coupled_columns, smooth_motion, take_probe
+from robotid.diagnosis.logs.probe import (
+    Probe,
+    coupled_columns,
+    drive_columns,
+    smooth_motion,
+    take_probe,
+)
 from robotid.diagnosis.logs.torque_checks import TorqueCheck, load_model
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
@@ -91,6 +97,7 @@ def test_the_fit_is_the_least_squares_of_all_joints_and_drives(ur5, ur5_log):
     chi, theta, error = model.fit(scale)
     assert model.misfit(scale) == pytest.approx(chi, rel=1e-9)
     N, n, bodies = len(probe.rows), 6, 6
+    drives = drive_columns(ur5, probe.q, probe.v, probe.a)
     pi = ur5.standard_parameters()[: ur5.layout.n_inertial].reshape(-1, 10)
     Y = joint_torque_regressor(ur5, probe.q, probe.v, probe.a)[:, : ur5.layout.n_inertial]
     Y = Y.reshape(N, n, bodies, 10)
@@ -98,7 +105,7 @@ def test_the_fit_is_the_least_squares_of_all_joints_and_drives(ur5, ur5_log):
     for j in range(n):
         sigma = np.sqrt(0.05**2 + share[j]) * probe.tau[:, j].std() / np.sqrt(20.0 / N)
         own = np.column_stack([np.einsum("kbi,bi->kb", Y[:, j], pi), Y[:, j, -1, :4]])
-        drive = probe.drives[:, j]
+        drive = drives[:, j]
         others = np.zeros((N, n * drive.shape[1]))
         others[:, j * drive.shape[1] : (j + 1) * drive.shape[1]] = drive
         rows.append(np.hstack([own, others]) / scale / sigma)
