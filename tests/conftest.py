@@ -15,6 +15,7 @@ gc.disable()  # until the tests begin: nothing that is imported is garbage
 import numpy as np
 import pytest
 from helpers.browsing import launch
+from helpers.driven import arm
 from helpers.paths import IN_CI, ROOT, URDF
 from helpers.synthetic import exact_log, truth
 from numba.core.event import Listener, register
@@ -89,6 +90,11 @@ def pytest_collection_finish():
     gc.freeze()
     gc.set_threshold(20_000)
     gc.enable()
+
+
+@pytest.fixture(scope="session")
+def plain():
+    return arm()
 
 
 @pytest.fixture(scope="session", autouse=True)

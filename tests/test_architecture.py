@@ -37,7 +37,7 @@ INSIDE_FUNCTIONS = {
     "yourdfpy": {"robot"},
     "meshcat": {"output/viewer"},
     "trimesh": {"robot", "output/viewer"},
-    "pandas": {"diagnosis/verdict"},
+    "pandas": {"identification"},
     "pyarrow": {"data/files"},
     "rosbags": {"data/files"},
     "h5py": {"data/files"},

@@ -21,9 +21,7 @@ from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.explanations import explained
 from robotid.diagnosis.residual.discrepancies import explain_residual
-from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.residual.misfit import settled
-from robotid.diagnosis.residual.model_error import settled_shapes, with_model_error
 from robotid.diagnosis.residual.term_trials import take_sample
 from robotid.diagnosis.urdf.inertials import (
     assumed_inertials,
@@ -45,6 +43,8 @@ from robotid.estimation.fitting.fit import fit_recordings, rough_choice, solve_r
 from robotid.estimation.fitting.fitted import Fit
 from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.estimation.variation.variation import vary
+from robotid.identification.drive_choice import choose_drives
+from robotid.identification.model_error import settled_shapes, with_model_error
 from robotid.identification.repeated_errors import with_repeated_errors
 from robotid.identification.result import StatedSettings, TorqueIdentification
 from robotid.robot.drives import AUTO, wanted_families

@@ -9,9 +9,8 @@ from typing import Any
 from robotid.base.findings import Finding
 from robotid.base.settings import Settings
 from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.residual.joint_torques import JointTorque, joint_torques
 from robotid.diagnosis.residual.misfit import Misfit
-from robotid.diagnosis.residual.torque_split import JointTorque, joint_torques
-from robotid.diagnosis.verdict.parameter_table import parameter_entries, parameter_table
 from robotid.diagnosis.verdict.scale_check import PayloadCheck, ScaleCheck, check_scale
 from robotid.diagnosis.verdict.verdict import (
     Determined,
@@ -24,6 +23,7 @@ from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.evaluation import Evaluated, Evaluation, Metrics, hidden_joints
 from robotid.estimation.fitting.fitted import Fit, Identified
 from robotid.estimation.variation.variation import Variation
+from robotid.identification.parameter_table import parameter_entries, parameter_table
 from robotid.identification.summary import (
     error_lines,
     friction_lines,

@@ -144,6 +144,18 @@ class Tree:
         return found
 
     @property
+    def carriers(self) -> dict[str, list[str]]:
+        """Names of the joints that carry each joint, by its name."""
+        arriving = {joint.child: joint for joint in self.joints}
+        carriers = dict[str, list[str]]()
+        for joint in self.joints:
+            at, above = joint, carriers.setdefault(joint.name, [])
+            while at.parent in arriving:
+                at = arriving[at.parent]
+                above.append(at.name)
+        return carriers
+
+    @property
     def xml(self) -> str:
         """A URDF with only the links, inertials and joints, with the numbers read here."""
         inertials = {link: inertial.xml for link, inertial in self.inertials.items()}

@@ -82,6 +82,13 @@ def plant(name, rng, **changes):
     return Plant(model, tuple(drives), np.array(middle), np.array(reach))
 
 
+def assert_recovered(estimate, truth, within=3.3, certain=0.15):
+    """Parameters are within so many errors of the truth by name, and errors a share of it."""
+    for name, value, error in zip(estimate.names, estimate.theta, estimate.std_error, strict=True):
+        assert abs(value - truth[name]) < within * error, name
+        assert not truth[name] or error < certain * truth[name], name  # an offset is 0
+
+
 def recorded(
     plant, rng, *, duration=10.0, rate=500.0, noise=1e-4, torque=None, speed=None, highest=4.0,
     step=_STEP,

@@ -12,7 +12,13 @@ from robotid.data.signals import process, resolve, unwrap
 from robotid.data.units import AT_REST
 from robotid.diagnosis.decisions import ZERO
 from robotid.dynamics.constraint_rows import touching
-from robotid.dynamics.rows import drive_values, friction_directions, friction_speeds, inertial_rows
+from robotid.dynamics.rows import (
+    InertialRows,
+    drive_values,
+    friction_directions,
+    friction_speeds,
+    inertial_rows,
+)
 from robotid.robot.model import RobotModel
 
 _MARGIN = 0.15  # [s] rows closer to the end of a segment are not used: the filter has not settled
@@ -40,39 +46,23 @@ class Probe:
         return cls(model, motion, rows, q, v, a, tau, touching(model, motion)[rows])
 
     @cached_property
-    def _places(self) -> tuple[Array, Array]:
-        """Rows and bodies of the carried columns, one entry for ten columns."""
-        rows, bodies = np.nonzero(self.model.support[:, : self.model.layout.n_inertial : 10])
-        return rows, bodies
-
-    @cached_property
-    def _ten(self) -> Array:
-        """Columns of the ten parameters of each carried body, shape (N, bodies carried, 10)."""
-        columns = inertial_rows(self.model, self.q, self.v, self.a).values.T
-        return columns.reshape(len(columns), -1, 10)
-
-    @cached_property
     def last_body(self) -> Array:
         """Columns of mass and first moments of the last body, shape (N, n, 4)."""
-        rows, bodies = self._places
-        is_last = bodies == self.model.layout.n_inertial // 10 - 1
-        last = np.zeros((*self.v.shape, 4))
-        last[:, rows[is_last]] = self._ten[:, is_last, :4]
-        return last
+        return self._torques(np.eye(self.model.layout.n_inertial)[:, -10:-6])
 
     @cached_property
     def loads(self) -> Array:
         """Torque of each link by the URDF, shape (N, n, bodies)."""
-        pi = self.model.standard_parameters()[: self.model.layout.n_inertial].reshape(-1, 10)
-        rows, bodies = self._places
-        loads = np.zeros((*self.v.shape, len(pi)))
-        loads[:, rows, bodies] = np.einsum("kbi,bi->kb", self._ten, pi[bodies])
-        return loads
+        pi = self.model.standard_parameters()[: self.model.layout.n_inertial]
+        return self._torques(pi[:, None] * np.repeat(np.eye(len(pi) // 10), 10, axis=0))
+
+    def _torques(self, stacked: Array) -> Array:
+        """Return the torques of bodies, shape (N, n, k): stacked (p, k)."""
+        return np.moveaxis(self._bodies.torque(stacked), 0, 2)
 
     @cached_property
-    def drives(self) -> Array:
-        """Columns of the drives, shape (N, n, 4 + k)."""
-        return drive_columns(self.model, self.q, self.v, self.a)
+    def _bodies(self) -> InertialRows:
+        return inertial_rows(self.model, self.q, self.v, self.a)
 
 
 def drive_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:

@@ -11,14 +11,14 @@ from robotid.base.typing import Array
 from robotid.data.units import STATIC
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import BEYOND_NOISE, NO_ERROR_OF_MASSES, SIGNIFICANT, ZERO
-from robotid.diagnosis.logs.probe import Probe
+from robotid.diagnosis.logs.probe import Probe, drive_columns
 from robotid.diagnosis.logs.readings import CERTAIN, EXPLAINED, Best, Samples, best_readings, limbs
+from robotid.robot.model import RobotModel
 
 _UNEXPLAINED = 0.25  # unexplained share of a torque's variance that is reported, not accepted
 _SPREAD = 0.3  # prior standard deviation of a link's mass, relative to the URDF's
 _PRECISION = 0.05  # of a torque, model errors included
 _INDEPENDENT, _PER_SECOND = 20.0, 3.0  # independent instants of a log, per second of a short one
-_MASS, _MOMENT = 20.0, 10.0  # [kg], [kg m] prior standard deviations of a payload
 _WORSE = 0.25  # allowed increase of a torque's misfit over its own fit, in variances
 _OTHER_UNIT = 30.0  # a common scale of all torques farther from 1 is another unit, no gain
 _SCALES = np.logspace(-3, 3, 61)
@@ -198,7 +198,7 @@ class LoadModel:
 
 def load_model(probe: Probe, share: Array) -> LoadModel:
     """Return the load model of a motion: share (n,)."""
-    N, n = probe.tau.shape
+    (N, n), drives = probe.tau.shape, drive_columns(probe.model, probe.q, probe.v, probe.a)
     duration = float(np.ptp(probe.motion.t[probe.rows]))
     independent = min(_INDEPENDENT, _PER_SECOND * duration)
     links = probe.loads
@@ -208,7 +208,7 @@ def load_model(probe: Probe, share: Array) -> LoadModel:
     used = (level > TINY * np.abs(probe.tau).max()) & (share < _UNEXPLAINED)
     R = np.zeros((n, bodies + 5, bodies + 5))
     for j in np.flatnonzero(used).tolist():
-        drive = probe.drives[:, j]
+        drive = drives[:, j]
         length = np.linalg.norm(drive, axis=0)
         U, s, _ = np.linalg.svd(drive / np.where(length > 0, length, 1.0), full_matrices=False)
         Q = U[:, s > TINY * s[0]]
@@ -216,7 +216,8 @@ def load_model(probe: Probe, share: Array) -> LoadModel:
         sigma = np.sqrt(_PRECISION**2 + share[j]) * level[j]
         R[j] = np.linalg.qr(left * np.sqrt(independent / N) / sigma, mode="r")
     mean = np.append(np.ones(bodies), np.zeros(4))
-    spread = np.append(np.full(bodies, _SPREAD), [_MASS, *[_MOMENT] * 3])
+    arm = _mass(probe.model)  # a payload is of its size
+    spread = np.append(np.full(bodies, _SPREAD), [arm, *[arm * probe.model.length] * 3])
     expected = independent * float((share / (_PRECISION**2 + share))[used].sum())
     return LoadModel(R, mean, spread, expected, independent * float(used.sum()))
 
@@ -257,6 +258,10 @@ def _is_compensated(probe: Probe) -> bool:
     return load_model(whole.probe, whole.share).is_this_robot()
 
 
+def _mass(model: RobotModel) -> float:
+    return float(model.standard_parameters()[: model.layout.n_inertial : 10].sum())
+
+
 def _error_of_links(theta: Array) -> float:
     return float(np.sum(((theta[:-4] - 1.0) / _SPREAD) ** 2))
 
@@ -272,12 +277,11 @@ def _torque_scale(model: LoadModel) -> tuple[float, bool]:
 
 def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Finding]:
     mass = float(load[0])
-    arm = float(probe.model.standard_parameters()[: probe.model.layout.n_inertial : 10].sum())
     if abs(mass) < BEYOND_NOISE * error:
         return
     link = probe.model.layout.bodies[-1]
     yield finding(
         "payload", name, subject=link, link=link, sense=mass > 0, cure=mass > 0,
-        severity="warning" if abs(mass) - 2 * error > _LARGE * arm else "note",
+        severity="warning" if abs(mass) - 2 * error > _LARGE * _mass(probe.model) else "note",
         mass=mass, std_error=error, mcx=load[1], mcy=load[2], mcz=load[3],
     )  # fmt: skip

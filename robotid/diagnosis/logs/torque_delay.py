@@ -194,11 +194,13 @@ def _window(
     own = np.stack([motion.a[rows], v, *signs, v * np.abs(v), *waves], axis=2)
     own = low_pass(own, 1 / step, signals)[::every][inner]
     state = motion.q[coarse], motion.v[coarse], motion.a[coarse]
-    inertial, coupled = inertial_rows(model, *state).values.T, coupled_columns(model, *state)
-    load = _interpolated(motion.t[coarse], np.abs(_of_urdf(model, inertial)), t) * signs[0]
+    bodies, coupled = inertial_rows(model, *state), coupled_columns(model, *state)
+    (urdf,) = bodies.torque(model.standard_parameters()[:, None])
+    load = _interpolated(motion.t[coarse], np.abs(urdf), t) * signs[0]
     load = low_pass(load, 1 / step, signals)[::every][inner]
     inertial, coupled = (
-        low_pass(columns, 1 / (step * every), signals)[inner] for columns in (inertial, coupled)
+        low_pass(columns, 1 / (step * every), signals)[inner]
+        for columns in (bodies.values.T, coupled)
     )
     at = motion.t[coarse[inner]]
     is_reversal = np.diff(np.sign(v), axis=0, append=np.sign(v[-1:])) != 0
@@ -208,15 +210,6 @@ def _window(
     delayed = np.moveaxis(_interpolated(t, tau, at + _GRID[:, None]), 0, 2)  # (N, n, delays)
     drive = np.concatenate([own, coupled], axis=2)  # (N, n, k)
     return inertial, drive, np.column_stack(steady), delayed, load
-
-
-def _of_urdf(model: RobotModel, carried: Array) -> Array:
-    """Return the torque of the URDF's bodies from their columns, shape (N, n)."""
-    size = model.layout.n_inertial
-    support, pi = model.support[:, :size], model.standard_parameters()[:size]
-    ends = np.cumsum(support.sum(axis=1))
-    weighted = np.cumsum(carried * np.concatenate([pi[row] for row in support]), axis=1)
-    return np.asarray(np.diff(weighted[:, ends - 1], axis=1, prepend=0.0))
 
 
 def _interpolated(t: Array, values: Array, times: Array) -> Array:

@@ -109,7 +109,10 @@ def rounded_angles(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]
     """Yield the angles of joints that a URDF rounds (3.1416 for pi)."""
     rounded = _rounded(model.tree)
     effect, figures = _effect(model, mapping) if rounded else ("none", {})
-    felt = _carrying(model.tree) if effect != "none" else set()
+    felt = set[str]()  # joints that move or carry a moving joint: their angles affect the dynamics
+    if effect != "none":
+        carriers = model.tree.carriers
+        felt.update(*((joint.name, *carriers[joint.name]) for joint in model.tree.movable))
     for is_felt in (True, False):
         joints = {name: exact for name, exact in rounded.items() if (name in felt) == is_felt}
         if not joints:
@@ -152,17 +155,6 @@ def _effect(model: RobotModel, mapping: BaseMapping) -> tuple[str, dict[str, flo
     if len(mapping.K) > len(meant.K):
         return "more", {"with_rounding": len(mapping.K), "meant": len(meant.K)}
     return ("seeming", {"seeming": seeming}) if seeming > 0 else ("none", {})
-
-
-def _carrying(tree: Tree) -> set[str]:
-    """Return the joints that move or carry a moving joint: their angles affect the dynamics."""
-    arriving = {joint.child: joint for joint in tree.joints}
-    carrying = {joint.name for joint in tree.movable}
-    for joint in tree.movable:
-        while joint.parent in arriving:
-            joint = arriving[joint.parent]
-            carrying.add(joint.name)
-    return carrying
 
 
 def audit_links(model: RobotModel) -> Iterator[Finding]:

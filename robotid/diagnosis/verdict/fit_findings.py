@@ -15,18 +15,16 @@ from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.residual.misfit import Misfit, misfit_finding
 from robotid.diagnosis.urdf.inertials import DENSEST, audit_bodies
-from robotid.diagnosis.verdict.parameter_table import correlated_parameters
 from robotid.diagnosis.verdict.verdict import BEATEN, NAMED, SMALL, is_harmless_cost
 from robotid.estimation.estimators.consistent_fit import slabs
 from robotid.estimation.fitting.estimator_settings import BoundedSettings, ConsistentSettings
-from robotid.estimation.fitting.fitted import CLEARLY, Fit
+from robotid.estimation.fitting.fitted import CLEARLY, Fit, Identified
 from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.estimation.variation.variation import UnlikeRun, Variation
 from robotid.robot.bodies import (
     body_boxes,
     body_points,
     density_share,
-    held_parameters,
     least_density,
     negligible_bodies,
 )
@@ -78,7 +76,7 @@ def fit_findings(
 def _costs(fit: Fit) -> Iterator[Finding]:
     """Yield the joints whose torque error the constraints increase."""
     # A note if they add little, sqrt(error^2 - wls^2), unless stated; or if WLS predicts worse.
-    wls, settings, locked = fit.metrics("wls").per_joint, fit.estimator, _locked_links(fit)
+    wls, settings = fit.metrics("wls").per_joint, fit.estimator
     asked = ""  # the constraints that the user states
     if isinstance(settings, BoundedSettings) and any(settings.constraints.values()):
         keys = listed(key for key, value in settings.constraints.items() if value)
@@ -89,12 +87,12 @@ def _costs(fit: Fit) -> Iterator[Finding]:
             continue
         error, least = measured.relative_error_pct, free.relative_error_pct or 0.0
         is_little = error is not None and error**2 - least**2 < SMALL**2
-        is_little = is_little and is_harmless_cost(error or 0.0, least) and not (asked or locked)
+        is_little = is_little and is_harmless_cost(error or 0.0, least) and not asked
         what = "overfitted" if joint in fit.overfitted else "costly"
         what = "little" if is_little else what
         yield finding(
             "constraint_costs", "", joint, severity="warning" if what == "costly" else "note",
-            what=what, cure=what, asked=asked, locked=locked, unit=measured.unit,
+            what=what, cure=what, asked=asked, unit=measured.unit,
             error_pct=error or 0.0, wls_error_pct=least, rmse=measured.rmse, wls_rmse=free.rmse,
         )  # fmt: skip
 
@@ -170,6 +168,33 @@ def correlated_findings(fit: Fit) -> Iterator[Finding]:
             )  # fmt: skip
 
 
+def _correlations(C: Array, own: Sequence[int]) -> Array:
+    """Return the correlations of parameters with each other, 0 of each with itself."""
+    error = np.sqrt(np.diag(C)[own])
+    return np.asarray(C[np.ix_(own, own)] / np.outer(error, error) - np.eye(len(own)))
+
+
+def correlated_sets(C: Array, own: Sequence[int]) -> list[list[int]]:
+    """Return the sets of parameters that strong correlations connect: C (p, p)."""
+    groups = decisions.connected(np.abs(_correlations(C, own)) > decisions.CORRELATED)
+    return [[own[k] for k in group] for group in groups]
+
+
+def correlated_parameters(fit: Identified) -> dict[int, tuple[int, float]]:
+    """Return drive parameters strongly correlated with another parameter of the same drive."""
+    layout, C, at_bound = fit.model.layout, fit.standard_covariance, fit.at_bound
+    pairs = {}
+    drive_of = enumerate([d for d, _ in layout.drive_parameters], start=layout.n_inertial)
+    used = [(k, drive) for k, drive in drive_of if C[k, k] > 0 and not at_bound[k]]
+    for drive in range(len(layout.drives)):
+        own = [k for k, of_drive in used if of_drive == drive]
+        for i, row in zip(own, _correlations(C, own), strict=True):
+            k = int(np.argmax(np.abs(row)))
+            if abs(row[k]) > decisions.CORRELATED:
+                pairs[i] = own[k], float(row[k])
+    return pairs
+
+
 def not_written(log_errors: Sequence[Finding], inconsistent: str = "") -> Iterator[Finding]:
     """Yield a warning that the URDF is not written, with the reason; nothing if it is written."""
     codes = listed(dict.fromkeys(error.code for error in log_errors))
@@ -189,18 +214,13 @@ def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]
 
 def _in_line(model: RobotModel) -> set[str]:
     """Return the joints that carry an identified joint, or are carried by one."""
-    above = {joint.child: joint for joint in model.tree.joints}
-    carriers: dict[str, set[str]] = {joint.name: set() for joint in model.tree.joints}
-    for joint in model.tree.joints:
-        link = joint.parent
-        while link in above:
-            carriers[joint.name].add(above[link].name)
-            link = above[link].parent
-    identified = set(model.joints)
+    carriers, identified = model.tree.carriers, set(model.joints)
     carrying = set[str]().union(*(carriers[name] for name in identified))
     # the position of a base changes no torque, only its orientation
     rotating = {joint.name for joint in model.tree.joints if joint.type != "prismatic"}
-    return carrying & rotating | {name for name, own in carriers.items() if own & identified}
+    return carrying & rotating | {
+        name for name, above in carriers.items() if identified.intersection(above)
+    }
 
 
 def log_findings(logs: Sequence[Log]) -> Iterator[Finding]:
@@ -365,25 +385,6 @@ def _of_outliers(fit: Fit) -> Finding:
         count=f"{len(outliers)} outlier{'s' * (len(outliers) > 1)}", places=len(outliers),
         largest=outliers[0].size,
     )  # fmt: skip
-
-
-def _locked_links(fit: Fit) -> str:
-    """Return the bodies that links on locked joints make barely possible, as text."""
-    # Such links keep the URDF's inertials: the moved link takes all their errors.
-    model, size = fit.model, fit.model.layout.n_inertial
-    held, identified = held_parameters(model), fit.standard[:size]
-    own, before = (
-        np.linalg.eigvalsh(pseudo_inertia(pi[:size] - held))[:, 0]
-        for pi in (identified, model.standard_parameters())
-    )
-    is_shrunk = own < decisions.DIFFERS * before
-    is_shrunk &= held[::10] > decisions.DIFFERS * identified[::10]
-    return "".join(
-        f"the URDF's inertials of the links on locked joints, {held[10 * k]:.3g} kg of the "
-        f"{identified[10 * k]:.3g} kg of {model.layout.bodies[k]} (identify their joints, too, if "
-        "they are wrong), "
-        for k in np.flatnonzero(is_shrunk)
-    )
 
 
 def _contradiction(fit: Fit) -> tuple[str, dict[str, str]]:

@@ -16,7 +16,7 @@ from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import sentence_of
 from robotid.diagnosis.decisions import AGREES, BETTER, BEYOND_NOISE, DIFFERS, ZERO
 from robotid.dynamics.constraint_rows import loop_basis, without_forces
-from robotid.dynamics.torque import joint_torque_regressor, predict
+from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.fitting.fitted import CLEARLY, Fit
 from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.robot.parameters import pseudo_inertia
@@ -53,8 +53,9 @@ class KnownMass(ABC):
         """Both masses, and what follows for the scale of the torques."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the figures as result.json has them."""
-        return {key: list(x) if isinstance(x, tuple) else x for key, x in vars(self).items()}
+        """Return the figures as result.json has them, and what they mean."""
+        figures = {key: list(x) if isinstance(x, tuple) else x for key, x in vars(self).items()}
+        return figures | {"message": self.message}
 
     @classmethod
     def from_dict(cls, stated: Mapping[str, Any]) -> Self:
@@ -134,10 +135,6 @@ class PayloadCheck(KnownMass):
             limit=AGREES, large=ratio > 1.0, ratio=ratio,
         )  # fmt: skip
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the figures as result.json has them, and what they mean."""
-        return super().to_dict() | {"message": self.message}
-
 
 @dataclass(frozen=True)
 class ScaleCheck:
@@ -157,7 +154,6 @@ class ScaleCheck:
     is_total_determined: bool = (
         False  # within 5 % by torque alone: a measured one verifies the scale
     )
-    friction: Mapping[str, float] = field(default_factory=dict)  # its share of each torque [-]
     follows: bool = True  # the data, about as well as WLS, and not the prior
     #: Factor common to the joints' ratios and its 95 % half-width [-]; None with fewer than two.
     common: tuple[float, float] | None = None
@@ -333,8 +329,8 @@ def check_scale(fit: Fit) -> ScaleCheck:
         for j, free in errors[1].items()
     )
     plain = ScaleCheck(
-        masses=(before, after, 0.0), stated=stated_mass(fit), friction=friction_shares(fit),
-        follows=follows, is_total_determined=determines_total_mass(fit),
+        masses=(before, after, 0.0), stated=stated_mass(fit), follows=follows,
+        is_total_determined=determines_total_mass(fit),
     )  # fmt: skip
     if model.free_flyer:  # gravity loads its base with the whole mass
         ratio = after / before if before > 0 else 1.0
@@ -402,19 +398,6 @@ def common_factor(ratios: Array, sensitivity: Array, inertial: Array) -> tuple[f
     free = len(ratios) - 1
     spread = np.linalg.norm(r - factor * one) / np.sqrt(free)
     return factor, float(scipy.special.stdtrit(free, 0.975) * spread / np.linalg.norm(one))
-
-
-def friction_shares(fit: Fit) -> dict[str, float]:
-    """Return the share of friction in the RMS torque of each joint [-]; 0 of a torque that is 0."""
-    layout = fit.model.layout
-    is_friction = [name.endswith((".viscous", ".coulomb")) for name in layout.names]
-    pi = np.where(is_friction, fit.standard, 0.0)
-    motions = [e.recording.trajectory for e in fit.fitted]
-    torque = np.vstack([predict(fit.model, [pi], motion)[0] for motion in motions])
-    measured = np.vstack([motion.tau for motion in motions])
-    torque, measured = np.linalg.norm([torque, measured], axis=1)
-    share = np.divide(torque, measured, where=measured > 0.0, out=np.zeros_like(torque))
-    return dict(zip(fit.model.row_names, share.tolist(), strict=True))
 
 
 def stated_mass(fit: Fit) -> StatedMass | None:

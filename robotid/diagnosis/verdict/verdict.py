@@ -39,21 +39,9 @@ _NOT_VERIFIED = "not verified, no validation log"
 _UNSCALED = "torque scale not verified"
 _HYPOTHESES = ("current_for_torque", "gravity", "gravity_compensated", "unexplained_torque",
                "urdf_mismatch")  # fmt: skip
-_STATIC = (
-    "static model: gravity, offsets and Coulomb friction were identified. Inertias, armature and "
-    "viscous friction keep the URDF's values: the result is valid at rest and for slow motion"
-)
-_HIDDEN = "gravity changes its torque less than friction does at rest"
 # places that are not a recording
 _OF_THE_FIT = ("all joints", "estimator", "recordings", "standard_parameters")
-#: Simpler models, by name of the baseline; "urdf" has fitted drives where torques are the input.
-_SIMPLER = {
-    "command": "the command itself",
-    "second_order": "a second-order model",
-    "urdf": "the URDF with the given gains",
-    "rows": "the fit to torques alone",
-    "steady": "constant velocity from the start",
-}
+_SIMPLER = ("command", "second_order", "urdf", "rows", "steady")  # baselines of simpler models
 
 
 @dataclass(frozen=True)
@@ -349,6 +337,7 @@ def judge(
 ) -> Verdict:  # fmt: skip
     """Return the verdict on a result."""
     evidence, hidden = predictions.on_each(), predictions.hidden
+    unseen = sentence_of("verdict:note", what="hidden")
     costly = [w for w in warnings if w.effect == "poor" and w.joint in evidence]
     for warning in costly:
         evidence[warning.joint].poor.extend((2, text) for text in _described([warning]))
@@ -369,8 +358,8 @@ def judge(
         *determined.notes(),
         *predictions.of_base(),
         *([] if is_far else scale),
-        *([f"{listed(hidden)}: {_HIDDEN}: not evaluated"] if hidden else []),
-        *([_STATIC] if determined.is_static else []),
+        *([f"{listed(hidden)}: {unseen}: not evaluated"] if hidden else []),
+        *([sentence_of("verdict:note", what="static")] if determined.is_static else []),
     ]
     of_torque = [warning for warning in warnings if warning.code not in codes_with("of_body")]
     per_joint = {
@@ -378,22 +367,18 @@ def judge(
             _ranked(one.poor),
             [*one.cautions, *_described([w for w in of_torque if w.joint in ("", joint)])],
             is_tested=bool(one.errors),
-            checked=f"error at most {max(one.errors):.1f} %, smaller than with a constant torque "
-            "and with the URDF"
+            checked=sentence_of("verdict:good", what="joint", error=max(one.errors))
             if one.errors
             else predictions.why_untested(joint),
         )
         for joint, one in evidence.items()
     }
-    per_joint |= {joint: JointVerdict("not evaluated", (_HIDDEN,)) for joint in hidden}
+    per_joint |= {joint: JointVerdict("not evaluated", (unseen,)) for joint in hidden}
     if cause_of is not None:
         _explain_largest_error(per_joint, evidence, cause_of)
     errors = {joint: max(one.errors, default=0.0) for joint, one in evidence.items()}
-    good = (
-        f"torque prediction error on {logs_that_test(predictions.validation)}: at most "
-        f"{max(errors.values(), default=0.0):.1f} % at every joint, smaller than with a "
-        "constant torque and with the URDF; all parameters are physically consistent"
-    )
+    largest_error, logs = max(errors.values(), default=0.0), logs_that_test(predictions.validation)
+    good = sentence_of("verdict:good", what="torque", logs=logs, error=largest_error)
     poor = _ranked(reason for one in largest for reason in one.poor)
     verdict = concluded(
         per_joint, poor=poor, warnings=reasons, good=good, notes=notes, log_errors=log_errors
@@ -578,11 +563,8 @@ def judge_positions(
     unseen = "prediction of unseen motion not evaluated: no validation log given"
     warnings = [*cautions, *([] if is_validation else [unseen])]
     warnings += [] if is_settled else ["the fit has not converged"]
-    good = (
-        "simulated position error on validation logs: at most "
-        f"{max(errors.values(), default=0.0):.2g} % of each joint's RMS motion, smaller than with "
-        "simpler models"
-    )
+    largest_error = max(errors.values(), default=0.0)
+    good = sentence_of("verdict:good", what="position", error=largest_error)
     verdict = concluded(
         verdicts, poor=reasons["poor"], good=good, notes=[scale] if scale else [],
         warnings=[*warnings, *reasons["not evaluated"], *reasons["usable"]],
@@ -601,21 +583,21 @@ def _judge_position(
     if fitted is not None and simple is not None:
         error = error_of(fitted)
         if error > max(GOOD, HARDLY * simple):
-            lacking = (
-                f"{joint}: simulated position error {error:.2g} % of its RMS motion on the fitted "
-                f"logs, {simple:.2g} % with a second-order model: the model lacks an effect of "
-                "this joint, such as a torque limit"
-            )
+            figures = {"error": error, "simple": simple}
+            lacking = sentence_of("verdict:joint", what="lacking", subject_of=joint, **figures)
             return on_joint([lacking], [], is_tested=is_validation, checked=lacking)
     if measured is None:
-        still = f"{joint}: commanded to rest in all logs: not evaluated"
+        still = sentence_of("verdict:joint", what="still", subject_of=joint)
         return on_joint([], [], is_tested=False, checked=still)
     error, baselines = error_of(measured), measured.baselines
     simpler = {key: other for key, other in baselines.items() if other is not None}
     beaten = [key for key in _SIMPLER if error > BEATEN * simpler.get(key, math.inf)]
-    words = _SIMPLER | ({"urdf": "the URDF with fitted drives"} if "steady" in baselines else {})
-    text = f"{joint}: simulated position error {error:.2g} % of its RMS motion"
-    text += f"; smaller with {listed(words[key] for key in beaten)}" * bool(beaten)
+    # where torques are the input, the URDF has fitted drives
+    names = ["driven" if key == "urdf" and "steady" in baselines else key for key in beaten]
+    text = sentence_of(
+        "verdict:joint", what="position", subject_of=joint, error=error, smaller=bool(names),
+        simpler=listed(sentence_of("verdict:simpler", what=name) for name in names),
+    )  # fmt: skip
     is_poor = is_validation and (error > POOR_POSITION or "command" in beaten)
     is_usable = is_validation and not is_poor and (error > GOOD_POSITION or bool(beaten))
     return on_joint([text] * is_poor, [text] * is_usable, is_tested=is_validation, checked=text)

@@ -172,9 +172,8 @@ def fit_loops(
             break
         for t, why in failing.items():
             dropped[f"{t.joint}.{t.terms[0]}"] = replace(t, is_chosen=False, dropped=why)
-    scale = None
-    if initialised.linear is None and is_stated(loop.kp, model).all():
-        scale = gain_scale(simulator, estimator, estimate)
+    is_scaled = initialised.linear is None and is_stated(loop.kp, model).all()
+    scale = gain_scale(simulator, estimator, estimate) if is_scaled else None
     others = (initialised.encoders, tuple(tried), initialised.linear, scale)
     return Fitted(simulator, estimate, initialised.plain, *others)
 
@@ -191,11 +190,9 @@ def fit_one_log(fitted: Fitted, log: Log) -> Loops:
 def fit_gains(
     simulator: LoopSimulator, loops: Loops, log: Log, joints: Array
 ) -> dict[int, dict[str, float]]:
-    """Return the gains of joints (k,) fitted to one log, all else unchanged; {} if it fails.
-
-    The figures of a joint are the ratio of kp to that of the loops with its standard error, that of
-    kd, 0 where the loops have none, and the position errors before and after [% of RMS motion].
-    """
+    """Return the gains of joints (k,) fitted to one log, all else unchanged; {} if it fails."""
+    # relative to those of the loops: the ratio of kp with its standard error, and of kd, 0 without
+    # one; and the errors of simulated positions before and after [% of RMS motion]
     windows, own = _few(cut_windows(log, _WINDOW, _LEAD)), np.stack([loops.kp, loops.kd])[:, joints]
     pairs = [(what, int(j)) for what in ("kp", "kd") for j in joints]
     free = tuple(FreeParameter(f"{w} {j}", w, (j,), 0.0, np.inf, 0.0) for w, j in pairs)

@@ -12,12 +12,12 @@ from robotid.base.settings import require_kind
 from robotid.base.typing import Array
 from robotid.base.versions import __version__, versions
 from robotid.data.signal_settings import Transmission
-from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.drive_terms import DriveChoice
 from robotid.estimation.fitting.evaluation import LEFT_OUT, Evaluated, Evaluation
 from robotid.estimation.fitting.fitted import SOURCES, Identified, next_errors
 from robotid.estimation.fitting.standard_errors import QUANTILE
+from robotid.identification.parameter_table import parameter_entries
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.output.files.ranges import covariance_entry, parameter_ranges
 from robotid.output.files.result_file import SCHEMA_VERSION

@@ -17,13 +17,13 @@ from robotid.base.settings import require_kind
 from robotid.base.tolerances import SLACK
 from robotid.base.typing import Array
 from robotid.data.log import Log
-from robotid.diagnosis.verdict.parameter_table import parameter_table
 from robotid.diagnosis.verdict.scale_check import PayloadCheck, ScaleCheck, StatedMass
 from robotid.dynamics.friction_projection import DriveMoments, projected_pinocchio_model
 from robotid.dynamics.torque import predict_instants
 from robotid.estimation.fitting.standard_errors import FrictionCurve
 from robotid.estimation.variation.groups import RunSums
 from robotid.estimation.variation.variation import between_covariance
+from robotid.identification.parameter_table import parameter_table
 from robotid.output.files.shape import check_shape, require_lengths, schema
 from robotid.output.files.urdf import load_identified, terms_from_facts
 from robotid.robot.model import RobotModel

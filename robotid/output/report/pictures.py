@@ -7,13 +7,9 @@ from robotid.base.exceptions import DataError
 from robotid.base.findings import listed, suggestion
 from robotid.base.settings import require_kind
 from robotid.base.typing import Array
-from robotid.diagnosis.residual.torque_split import (
-    Dependence,
-    JointTorque,
-    friction_split,
-    spread_rows,
-)
+from robotid.diagnosis.residual.joint_torques import Dependence, JointTorque, spread_rows
 from robotid.dynamics.torque import drive_motion_along
+from robotid.dynamics.torque_split import friction_split
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.fitted import friction_curve
 from robotid.estimation.fitting.standard_errors import QUANTILE, TorqueBand
@@ -156,7 +152,7 @@ def friction_chart(
     """Return friction against speed: measured, identified, and at constant speed."""
     evaluation, model = shown_evaluation(found), found.model
     motion, row = evaluation.recording.trajectory, model.row_names.index(joint)
-    left, friction = split or friction_split(model, evaluation, found.standard)
+    left, friction = split or friction_split(model, motion, found.standard)
     rows = np.flatnonzero(evaluation.recording.mask[:, row])
     rows = rows[:: max(1, -(-len(rows) // _POINTS))]
     is_driven = joint in model.joints and joint not in model.passive

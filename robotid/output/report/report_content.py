@@ -18,9 +18,9 @@ from robotid.base.typing import Array
 from robotid.base.versions import __version__
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.decisions import LEAST_SHARE
-from robotid.diagnosis.residual.torque_split import JointTorque, friction_split
-from robotid.diagnosis.verdict.parameter_table import parameter_entries
+from robotid.diagnosis.residual.joint_torques import JointTorque
 from robotid.diagnosis.verdict.verdict import uses_line
+from robotid.dynamics.torque_split import friction_split
 from robotid.estimation.fitting.evaluation import Evaluated, Evaluation
 from robotid.estimation.fitting.fitted import next_errors
 from robotid.identification.closed_loop.position_errors import (
@@ -28,6 +28,7 @@ from robotid.identification.closed_loop.position_errors import (
     PositionEvaluation,
     pool_positions,
 )
+from robotid.identification.parameter_table import parameter_entries
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.identification.summary import left_out_lines
 from robotid.output.files.entries import loop_parameters
@@ -495,7 +496,8 @@ def _friction(found: TorqueIdentification) -> str:
     model, layout = found.model, found.model.layout
     if model.is_static or all(term.is_inertia for _, term in layout.drive_parameters):
         return ""
-    split = friction_split(model, pictures.shown_evaluation(found), found.standard)
+    motion = pictures.shown_evaluation(found).recording.trajectory
+    split = friction_split(model, motion, found.standard)
     figures = ""
     for joint in model.row_names:
         chart = pictures.friction_chart(found, joint, split=split)

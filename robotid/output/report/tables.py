@@ -10,10 +10,10 @@ import numpy as np
 
 from robotid.base.findings import listed
 from robotid.base.versions import versions
-from robotid.diagnosis.verdict.parameter_table import CENTRAL_TERMS, central_parameters
 from robotid.diagnosis.verdict.verdict import GOOD, GOOD_POSITION, POOR, POOR_POSITION
 from robotid.estimation.fitting.evaluation import Metrics
 from robotid.estimation.variation.variation import Variation, VaryingParameter
+from robotid.identification.parameter_table import CENTRAL_TERMS, central_parameters
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.identification.summary import joint_reason, verdict_cell
 from robotid.output.files.entries import input_entries

@@ -14,17 +14,16 @@ from helpers.synthetic import exact_log, truth
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.diagnosis.decisions import FEWEST, p_value
-from robotid.diagnosis.residual.torque_split import (
+from robotid.diagnosis.residual.joint_torques import (
     JointTorque,
     Rows,
     _broadband_shares,
     even_bins,
     follow,
-    friction_split,
     joint_torques,
-    split_torque,
 )
 from robotid.dynamics.torque import joint_torque_regressor, predict, remember
+from robotid.dynamics.torque_split import friction_split, split_torque
 from robotid.estimation.fitting.evaluation import evaluate_logs
 from robotid.estimation.fitting.recorded import hold_log
 from robotid.robot.drives import Harmonic, Hat, Lag, LoadFriction, Presliding, Spring, Stribeck
@@ -419,7 +418,7 @@ def test_friction_is_the_torque_that_viscous_coulomb_and_offset_add(ur5, rng):
     pi = truth(ur5)
     log = hold_log(ur5, exact_log(ur5, pi, rng), SignalSettings(cutoff=None))
     ((evaluation,), ()) = evaluate_logs([log], (), {"estimate": pi}, ur5.standard_parameters())
-    left, friction = friction_split(ur5, evaluation, pi)
+    left, friction = friction_split(ur5, evaluation.recording.trajectory, pi)
     value = dict(zip(ur5.layout.names, pi, strict=True))
     v = evaluation.recording.trajectory.v
     for j, name in enumerate(ur5.joints):

@@ -8,18 +8,15 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from robotid.diagnosis.verdict import parameter_table
 from robotid.diagnosis.verdict.fit_findings import (
     consistency_findings,
     correlated_findings,
-    locked_findings,
-)
-from robotid.diagnosis.verdict.parameter_table import (
-    central_parameters,
     correlated_parameters,
     correlated_sets,
+    locked_findings,
 )
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.identification.parameter_table import HEADERS, central_parameters
 from robotid.output.files.entries import build_result
 from robotid.output.files.result_file import Result
 from robotid.robot.bodies import density_share
@@ -149,7 +146,7 @@ def written(identified, tmp_path):
 @pytest.mark.parametrize("of", ["found", "loaded"])
 def test_a_data_frame_has_a_row_for_each_parameter(identified, written, of):
     frame = (identified if of == "found" else written).table()
-    assert list(frame.columns) == list(parameter_table.HEADERS)
+    assert list(frame.columns) == list(HEADERS)
     assert tuple(frame["part"] + "." + frame["parameter"]) == identified.model.layout.names
     np.testing.assert_array_equal(frame["value"], identified.standard)
     size = identified.model.layout.n_inertial

@@ -1,4 +1,3 @@
-import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -109,19 +108,6 @@ def test_without_gravity_nothing_bears_witness(four):
     assert found.scale_check.scale is None
     assert not found.scale_check.agrees
     assert "gravity loads no joint" in found.verdict.reasons[-1]
-
-
-def test_friction_stands_beside_it_as_a_share_of_the_torque(ur5, alike):
-    found = alike
-    layout, (e,) = ur5.layout, found.fitted
-    viscous, coulomb = (
-        found.standard[layout.names.index(f"wrist_3_joint.{term}")]
-        for term in ("viscous", "coulomb")
-    )
-    v, tau = e.recording.trajectory.v[:, 5], e.recording.trajectory.tau[:, 5]
-    share = np.linalg.norm(viscous * v + coulomb * np.sign(v)) / np.linalg.norm(tau)
-    assert found.scale_check.friction["wrist_3_joint"] == pytest.approx(share, rel=1e-9)
-    json.dumps(found.scale_check.to_dict(), allow_nan=False)
 
 
 def test_a_result_that_its_prior_holds_back_bears_no_witness(four, rng):

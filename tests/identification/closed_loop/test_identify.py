@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.mujoco_plant import held, multisine, plant, recorded
+from helpers.mujoco_plant import assert_recovered, held, multisine, plant, recorded
 
 from robotid.data.log import Log
 from robotid.diagnosis.catalogue import finding
@@ -58,13 +58,6 @@ def scaleless(leg):
     robot, log, kept = leg
     loop = LoopSettings(groups={"upper": list(robot.model.joints[:2])})
     return identify_loops(robot.model, [log], [kept], loop, SETTINGS, chooses=False)
-
-
-def assert_recovered(estimate, truth):
-    for name, value, error in zip(estimate.names, estimate.theta, estimate.std_error, strict=True):
-        assert abs(value - truth[name]) < 3.3 * error, name
-        if not name.endswith("offset"):  # which is 0
-            assert error < 0.15 * truth[name], name
 
 
 def test_the_drives_of_a_leg_are_recovered_within_their_errors(leg, found):

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.stats import norm
 
-from robotid.diagnosis.residual.torque_split import joint_torques
+from robotid.diagnosis.residual.joint_torques import joint_torques
 from robotid.output.report import pictures
 from robotid.output.report.pictures import why_charts
 

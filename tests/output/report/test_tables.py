@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from helpers.pages import tables
 
-from robotid.diagnosis.verdict.parameter_table import central_parameters
 from robotid.estimation.variation.spread import Mixture, Prediction
 from robotid.estimation.variation.variation import UnlikeRun, Variation, VaryingParameter
+from robotid.identification.parameter_table import central_parameters
 from robotid.output.report.next_steps import Origin
 from robotid.output.report.report_content import torque_report
 from robotid.output.report.tables import variation_section

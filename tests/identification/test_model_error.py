@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from helpers.driven import ELBOW, LIFT, driven, driven_log, found_in
 
-from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.residual.misfit import find_misfits
 from robotid.diagnosis.residual.term_trials import take_sample
 from robotid.dynamics.torque import trajectory_regressor
 from robotid.estimation.fitting.drive_terms import open_torques
 from robotid.estimation.fitting.fitted import expected_band, friction_curve
+from robotid.identification.drive_choice import choose_drives
 from robotid.robot.drives import LoadFriction, Stribeck
 
 QUANTILE = 1.5

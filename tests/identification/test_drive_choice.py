@@ -13,7 +13,6 @@ from helpers.stands import recorded, stand
 import robotid
 from robotid.base.exceptions import SettingsError
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.residual.term_trials import Trials, take_sample
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.constraint_rows import without_forces
@@ -21,6 +20,7 @@ from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.fit import solve_recordings
 from robotid.estimation.fitting.fitted import friction_curve
 from robotid.estimation.fitting.recorded import Recordings, hold_log
+from robotid.identification.drive_choice import choose_drives
 from robotid.robot.constraints import Contact
 from robotid.robot.drive_term import DriveMotion
 from robotid.robot.drives import AUTO, FAMILIES, Harmonic, Lag, LoadFriction, Stribeck, Tanh

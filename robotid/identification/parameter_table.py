@@ -1,7 +1,7 @@
 """Parameters of a result as tables: with correlations, and about the centres of mass."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from robotid.base.files import finite
 from robotid.base.typing import Array
-from robotid.diagnosis.decisions import CORRELATED, connected
+from robotid.diagnosis.verdict.fit_findings import correlated_parameters
 from robotid.estimation.fitting.fitted import Fit, Identified
 
 #: Columns of a row; low and high are the ends of the 95 % interval, source what determined it.
@@ -60,33 +60,6 @@ def parameter_table(
     except ImportError:
         return [dict(zip(HEADERS, row, strict=True)) for row in rows]
     return pandas.DataFrame(rows, columns=list(HEADERS)).astype(dict.fromkeys(_NUMBERS, float))
-
-
-def _correlations(C: Array, own: Sequence[int]) -> Array:
-    """Return the correlations of parameters with each other, 0 of each with itself."""
-    error = np.sqrt(np.diag(C)[own])
-    return np.asarray(C[np.ix_(own, own)] / np.outer(error, error) - np.eye(len(own)))
-
-
-def correlated_sets(C: Array, own: Sequence[int]) -> list[list[int]]:
-    """Return the sets of parameters that strong correlations connect: C (p, p)."""
-    groups = connected(np.abs(_correlations(C, own)) > CORRELATED)
-    return [[own[k] for k in group] for group in groups]
-
-
-def correlated_parameters(fit: Identified) -> dict[int, tuple[int, float]]:
-    """Return drive parameters strongly correlated with another parameter of the same drive."""
-    layout, C, at_bound = fit.model.layout, fit.standard_covariance, fit.at_bound
-    pairs = {}
-    drive_of = enumerate([d for d, _ in layout.drive_parameters], start=layout.n_inertial)
-    used = [(k, drive) for k, drive in drive_of if C[k, k] > 0 and not at_bound[k]]
-    for drive in range(len(layout.drives)):
-        own = [k for k, of_drive in used if of_drive == drive]
-        for i, row in zip(own, _correlations(C, own), strict=True):
-            k = int(np.argmax(np.abs(row)))
-            if abs(row[k]) > CORRELATED:
-                pairs[i] = own[k], float(row[k])
-    return pairs
 
 
 @dataclass(frozen=True, eq=False)

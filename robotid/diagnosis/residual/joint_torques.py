@@ -1,8 +1,4 @@
-"""Parts of a joint's torque, and what its residual depends on: quantities, frequency, lag.
-
-A torque is the sum of gravity, inertia, velocity torques, and the torques of the drives:
-
-    tau = g(q) + M(q) a + C(q, v) v + friction + motor inertia + offset + ... + residual.
+"""Torque of each joint, and what its residual depends on: quantities, frequency, lag.
 
 The dependence of the residual is cross-validated: neighbouring samples are correlated, so whole
 segments are held out in turn, and the means of the bins in the other segments predict each.
@@ -21,61 +17,12 @@ from robotid.base.typing import Array
 from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import sentence_of
 from robotid.dynamics.prepared_logs import independent_share
-from robotid.dynamics.rows import drive_values, friction_directions
-from robotid.dynamics.torque import predict, rigid_parts
+from robotid.dynamics.torque_split import split_torque
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.fitted import Fit
-from robotid.robot.model import RobotModel
 
-_RIGID = ("gravity", "inertia", "Coriolis")
 _QUARTERS = 4  # parts of a recording for the test of a drift, and pieces of each part
 _BINS = 10  # of a quantity, with equal numbers of samples
-
-
-@dataclass(frozen=True, eq=False)
-class TorqueSplit:
-    """Parts of predicted torques."""
-
-    # "gravity", "inertia", "Coriolis" of bodies, then those of drives, by ``DriveTerm.part``.
-
-    parts: Mapping[str, Array]  # each of shape (N, n_rows) [N m, N]
-    names: tuple[str, ...]  # of the k drive parameters
-    kinds: tuple[str, ...]  # part that each of them belongs to
-    terms: Array  # (k, N), torque of each of them at its drive [N m, N]
-    loads: Array  # (n_rows, k), ratio of each row to the drive of each parameter [-]
-
-    @cached_property
-    def load(self) -> Array:
-        """The torque of the bodies, shape (N, n_rows) [N m, N]."""
-        return np.asarray(sum(self.parts[name] for name in _RIGID if name in self.parts))
-
-    def terms_of(self, row: int) -> dict[str, dict[str, Array]]:
-        """Return the torque (N,) of each drive parameter in a row, by part and name."""
-        terms: dict[str, dict[str, Array]] = {}
-        for k in np.flatnonzero(self.loads[row]):
-            of_kind = terms.setdefault(self.kinds[k], {})
-            of_kind[self.names[k]] = self.loads[row, k] * self.terms[k]
-        return terms
-
-
-def split_torque(
-    model: RobotModel, pi: Array, q: Array, v: Array, a: Array,
-    direction: Array | None = None, memory: Array | None = None,
-) -> TorqueSplit:  # fmt: skip
-    """Return the parts of the torques that parameters predict."""
-    # A static model has no torques of motion: gravity is the only part of the bodies.
-    layout, first = model.layout, model.n_rows - len(model.joints)
-    parts = dict(zip(_RIGID, rigid_parts(model, pi, q, v, a), strict=True))
-    if model.is_static:
-        parts = {"gravity": parts["gravity"]}
-    signs = friction_directions(layout, v, direction)
-    terms = pi[layout.n_inertial :, None] * drive_values(layout, q, v, a, signs, memory)  # (k, N)
-    loads = np.vstack([np.zeros((first, len(terms))), layout.drive_loads])  # (n_rows, k)
-    kinds = tuple(term.part for _, term in layout.drive_parameters)
-    for kind in dict.fromkeys(kinds):
-        own = [k for k, other in enumerate(kinds) if other == kind]
-        parts[kind] = terms[own].T @ loads[:, own].T  # (N, n_rows)
-    return TorqueSplit(parts, layout.drive_names, kinds, terms, loads)
 
 
 @dataclass(frozen=True, eq=False)
@@ -396,13 +343,3 @@ def even_bins(x: Array) -> Array:
     """Return the bin of each value: ten bins with equal numbers of samples, also split at 0."""
     edges = np.unique(np.append(np.quantile(x, np.arange(1, _BINS) / _BINS), 0.0))
     return np.unique(np.searchsorted(edges, x, side="right"), return_inverse=True)[1]
-
-
-def friction_split(model: RobotModel, evaluation: Evaluation, pi: Array) -> tuple[Array, Array]:
-    """Return the measured torque without rigid-body torques, and the identified friction."""
-    # tau - Y pi, with pi without friction and offset, and their torque.
-    layout, trajectory = model.layout, evaluation.recording.trajectory
-    is_drive_inertia = [term.is_inertia for _, term in layout.drive_parameters]
-    stiff = np.array([True] * layout.n_inertial + is_drive_inertia)
-    moved, whole = predict(model, [np.where(stiff, pi, 0.0), pi], trajectory)
-    return trajectory.tau - moved, whole - moved

@@ -1,7 +1,0 @@
-import pytest
-from helpers.driven import arm
-
-
-@pytest.fixture(scope="session")
-def plain():
-    return arm()
