@@ -56,6 +56,10 @@ class Plant:
         }
 
     @property
+    def gains(self) -> dict[str, dict[str, float]]:
+        return {key: {d.joint: getattr(d, key) for d in self.drives} for key in ("kp", "kd")}
+
+    @property
     def parameters(self) -> np.ndarray:
         """The standard parameters of the URDF's bodies and of the drives."""
         pi, names = self.model.standard_parameters(), self.model.layout.names

@@ -153,10 +153,7 @@ def test_a_zero_is_found_to_the_grid_and_then_by_the_fit(moved):
     assert (first.zero[[0, 2]] == 0.0).all()
     assert first.next_zero[1] == 0.0  # that of the URDF, so gain and margin are of the same two
     np.testing.assert_allclose(first.gain, [0.0, 1.0 - 1.0 / (1.0 + first.margin[1]), 0.0])
-    drives = robot.drives
-    loop = LoopSettings(
-        kp={d.joint: d.kp for d in drives}, kd={d.joint: d.kd for d in drives}, zeros="find"
-    )
+    loop = LoopSettings(**robot.gains, zeros="find")
     found = identify_loops(robot.model, [log], [], loop, SETTINGS, chooses=False)
     zero = dict(zip(found.fit.estimate.names, found.fit.estimate.theta, strict=True))
     assert zero["FL_thigh_joint.zero"] == pytest.approx(AWAY, abs=0.03)
