@@ -1,11 +1,17 @@
+import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+from helpers.paths import URDF
+from helpers.synthetic import sine_log
 
 from robotid.base.exceptions import SettingsError
-from robotid.cli.job import Job, job_from_settings, read_job
+from robotid.cli.job import Job, LogEntry, job_from_settings, read_job
+from robotid.data.files.read import write_log
 from robotid.data.signal_settings import LogSource
-from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.estimation.fitting.estimator_settings import SimulationSettings
+from robotid.identification.closed_loop.loop_settings import LogGains, LoopSettings
 from robotid.robot.constraints import Loop
 from robotid.robot.parameters import Coupling
 
@@ -207,23 +213,27 @@ def test_a_controller_that_the_estimator_does_not_read_is_refused(tmp_path):
     job = job_from_settings(table, "job.toml", tmp_path)
     assert job.controller.kp == 20.0
     assert job.to_dict()["controller"]["kp"] == 20.0
-    entry = {"log": "a.csv", "controller": {"kp": {"b": 60.0}, "kd": 0.8}}
-    own = job_from_settings(table | {"identification": [entry]}, "job.toml", tmp_path)
-    assert own.to_dict()["identification"][0]["controller"] == entry["controller"]
-    gains = own.identification[0].controller
-    assert gains.factors(own.controller, ("a", "b")).tolist() == [[1.0, 3.0], [0.8, 0.8]]
-    with pytest.raises(SettingsError, match=r"kp is given for 'b', which is not a moving joint: a"):
-        gains.factors(own.controller, ("a",))
-    for common, has in (
-        (LoopSettings(kd=0.0), "kd = 0"),
-        (LoopSettings("torque"), "kind 'torque'"),
-    ):
-        with pytest.raises(
-            SettingsError, match=rf"\[controller\] has {has}, which no gain of a log"
-        ):
-            gains.factors(common, ("a", "b"))
     del table["controller"]
     assert "controller" not in job_from_settings(table, "job.toml", tmp_path).to_dict()
+
+
+def test_a_log_has_its_own_gains(tmp_path):
+    gains, path = LogGains(kp={"joint_2": 60.0}, kd=0.8), tmp_path / "a.csv"
+    write_log(sine_log(joints=("joint_1", "joint_2"), q_ref=np.zeros((60, 2))), path)
+    job = Job(
+        URDF / "planar_2r.urdf", estimator=SimulationSettings(), controller=LoopSettings(kp=20.0),
+        identification=(LogEntry(path, controller=gains),),
+    )  # fmt: skip
+    assert job_from_settings(job.to_dict(), "job.toml", tmp_path) == job
+    factors = job.read(job.identification[0], job.model(), needs="commands").gain_factors
+    assert factors.tolist() == [[1.0, 3.0], [0.8, 0.8]]
+    for common, words in (
+        (LoopSettings(kp=1.0, kd=0.0), "kd is 0.8, but [controller] has kd = 0"),
+        (LoopSettings("torque"), "[controller] has kind 'torque', which no gain of a log changes"),
+        (LoopSettings(kp={"j": 1.0}), "controller: kp is given for 'j', which is not a moving"),
+    ):
+        with pytest.raises(SettingsError, match=re.escape(words)):
+            gains.factors(common, ("joint_1", "joint_2"))
 
 
 def test_friction_that_is_stated_as_selected_is_the_default():
