@@ -115,7 +115,7 @@ class LogEntry(Settings):
         None, "name of the robot, if the logs are of several robots of one kind, as 'arm-07'"
     )
     controller: LogGains = setting(
-        LogGains(), "gains of this log where they differ from those of [controller]",
+        LogGains(), "gains that differ from [controller]",
         dump=lambda gains: gains.to_dict() or None,
     )  # fmt: skip
 

@@ -32,24 +32,22 @@ class LoopSettings(Settings):
         among=("pd", "torque"),
     )  # fmt: skip
     kp: PerJoint | None = setting(
-        None, "position gain [N m/rad or N/m], for all joints or by joint; default: fitted, "
-        "relative to gravity and inertia of the bodies", **GAIN,
+        None, "position gain [N m/rad or N/m]; default: fitted, relative to gravity and inertia of "
+        "the bodies", **GAIN,
     )  # fmt: skip
     kd: PerJoint | None = setting(
-        None, "speed gain [N m s/rad or N s/m], for all joints or by joint; default: part of the "
-        "viscous friction, or fitted if the logs have speed commands or torques", **LEVEL,
+        None, "speed gain [N m s/rad or N s/m]; default: part of the viscous friction, or fitted "
+        "if the logs have speed commands, torques, or own gains of a known ratio", **LEVEL,
     )  # fmt: skip
     limit: PerJoint | str | None = setting(
         None,
-        "torque limit of the drive [N m or N], for all joints or by joint; default: fitted "
-        "where the drive saturates; 'find': fitted for every joint",
+        "torque limit of the drive [N m or N]; default: fitted where the drive saturates; 'find': "
+        "fitted for every joint",
         reads=(int, float, dict, str),
         within=GAIN["within"],
         among=("find",),
     )
-    delay: PerJoint | None = setting(
-        None, "delay of the command [s], for all joints or by joint; default: fitted", **DELAY
-    )
+    delay: PerJoint | None = setting(None, "delay of the command [s]; default: fitted", **DELAY)
     delays: str = setting(
         "one", "the fitted delays: 'one' for the robot (bus and controller), or one per 'group'",
         among=("one", "group"),
@@ -89,15 +87,15 @@ class LoopSettings(Settings):
 
 @dataclass(frozen=True)
 class LogGains(Settings):
-    """Gains of one log, where they differ from those of ``[controller]``."""
+    """Gains of one log that differ from those in [controller]."""
 
     _table: ClassVar[str] = "controller of a log"
 
     kp: PerJoint | None = setting(
-        None, "position gain in this log, for all joints or by joint [N m/rad or N/m]; relative to "
-        "the fitted one [-] if [controller] has none; default: the gain of the other logs", **GAIN,
+        None, "position gain [N m/rad or N/m], relative to the fitted one [-] if [controller] has "
+        "none; default: the gain in [controller]", **GAIN,
     )  # fmt: skip
-    kd: PerJoint | None = setting(None, "speed gain in this log, likewise", **GAIN)
+    kd: PerJoint | None = setting(None, "speed gain, likewise", **GAIN)
 
     def factors(self, common: LoopSettings, joints: Sequence[str]) -> Array:
         """Return the gains over those of the controller, shape (2, n) [-]."""
