@@ -225,12 +225,14 @@ def work_space(entries: int) -> Array:
     return numbers[first : first + entries * LANES]
 
 
-def compiled(function: Any) -> Any:
-    """Compile without the interpreter's lock, and without an entry for it after an underscore."""
-    is_private = function.__name__.startswith("_")
-    # entries take a fifth of the time of compilation
-    entries = {"no_cfunc_wrapper": True, "no_cpython_wrapper": is_private}
-    return _cached(njit, function, nogil=True, **entries)
+def compiled(function: Any, **options: Any) -> Any:
+    """Compile without the interpreter's lock; arrays are not counted, so that none can be made."""
+    return _cached(njit, function, nogil=True, no_cfunc_wrapper=True, _nrt=False, **options)
+
+
+def inner(function: Any) -> Any:
+    """Compile for compiled code alone: an entry for Python would take longer than most code."""
+    return compiled(function, no_cpython_wrapper=True)
 
 
 def pointed(function: Callable[..., Any], arguments: int) -> Any:
@@ -246,25 +248,25 @@ def _cached(compile: Any, function: Any, **options: Any) -> Any:
         return compile(**options)(function)
 
 
-@compiled
+@inner
 def get(work, at):
     """Return a quantity."""
     return read(work, at * LANES)
 
 
-@compiled
+@inner
 def get3(work, at):
     """Return three neighbouring quantities."""
     return get(work, at), get(work, at + 1), get(work, at + 2)
 
 
-@compiled
+@inner
 def put(work, at, value):
     """Write a quantity."""
     write(work, at * LANES, value)
 
 
-@compiled
+@inner
 def put3(work, at, u):
     """Write three neighbouring quantities."""
     put(work, at, u[0])
@@ -272,37 +274,37 @@ def put3(work, at, u):
     put(work, at + 2, u[2])
 
 
-@compiled
+@inner
 def put_lane(work, at, lane, value):
     """Write a quantity of one lane."""
     work[np.uintp(at * LANES + lane)] = value  # Numba checks the sign of other indices
 
 
-@compiled
+@inner
 def cross(u, v):
     """Return u x v."""
     return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 
 
-@compiled
+@inner
 def add(u, v):
     """Return u + v."""
     return u[0] + v[0], u[1] + v[1], u[2] + v[2]
 
 
-@compiled
+@inner
 def scale(s, u):
     """Return s u."""
     return s * u[0], s * u[1], s * u[2]
 
 
-@compiled
+@inner
 def dot(u, v):
     """Return u . v."""
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
-@compiled
+@inner
 def times(J, u):
     """Return J u of a symmetric matrix xx xy yy xz yz zz."""
     return (
@@ -312,7 +314,7 @@ def times(J, u):
     )
 
 
-@compiled
+@inner
 def cos_sin(angle):
     """Return cosine and sine: Cody and Waite's reduction, fdlibm's polynomials, no branch."""
     n = (angle * 0.6366197723675814 + _ROUND) - _ROUND  # quarter turns
@@ -332,7 +334,7 @@ def cos_sin(angle):
     return where((quarter == 1.0) | (quarter == 2.0), -x, x), where(quarter > 1.5, -y, y)
 
 
-@compiled
+@inner
 def factor(work, n, H):
     """Write the Cholesky factor of H in place, its diagonal as reciprocals for ``solve``."""
     for j in range(n):
@@ -346,7 +348,7 @@ def factor(work, n, H):
                 put(work, H + i * n + j, x * get(work, H + j * n + j))
 
 
-@compiled
+@inner
 def solve(work, n, H, x):
     """Solve H y = x with the factor of H, in place."""
     for i in range(n):

@@ -38,6 +38,7 @@ from robotid.dynamics.kernels.lanes import (
     dot,
     get,
     get3,
+    inner,
     lane_of,
     put,
     put3,
@@ -52,62 +53,62 @@ _R, _P, VELOCITY, ACCELERATION, FRAME = 0, 9, 12, 18, 24
 _F, _C, _TV, _TA, _TF, BODY = 24, 30, 40, 46, 52, 58  # of derivatives, T: changes
 
 
-@compiled
+@inner
 def get6(work, at):
     """Return a spatial vector."""
     return get3(work, at), get3(work, at + 3)
 
 
-@compiled
+@inner
 def put6(work, at, x):
     """Write a spatial vector."""
     put3(work, at, x[0])
     put3(work, at + 3, x[1])
 
 
-@compiled
+@inner
 def gather(work, at, x):
     """Add to a spatial vector."""
     put6(work, at, joined(get6(work, at), x))
 
 
-@compiled
+@inner
 def joined(x, y):
     """Return x + y."""
     return add(x[0], y[0]), add(x[1], y[1])
 
 
-@compiled
+@inner
 def times6(s, x):
     """Return s x."""
     return scale(s, x[0]), scale(s, x[1])
 
 
-@compiled
+@inner
 def along(x, f):
     """Return the power of a force along a motion."""
     return dot(x[0], f[0]) + dot(x[1], f[1])
 
 
-@compiled
+@inner
 def motion_cross(x, y):
     """Return x x y, the derivative of the motion y fixed in a body with velocity x."""
     return add(cross(x[1], y[0]), cross(x[0], y[1])), cross(x[1], y[1])
 
 
-@compiled
+@inner
 def _force_cross(x, f):
     """Return x x* f, the derivative of the force f fixed in a body with velocity x."""
     return cross(x[1], f[0]), add(cross(x[1], f[1]), cross(x[0], f[0]))
 
 
-@compiled
+@inner
 def axis(joint):
     """Return the motion of a joint at the speed 1, in its body's frame."""
     return (joint[33], joint[34], joint[35]), (joint[36], joint[37], joint[38])
 
 
-@compiled
+@inner
 def placement(work, own):
     """Return the columns of R, and p, of a body in its parent."""
     return (
@@ -116,7 +117,7 @@ def placement(work, own):
     )  # fmt: skip
 
 
-@compiled
+@inner
 def _into_child(T, x):
     """Return a motion from the parent's frame in the body's frame: X^-1 x."""
     X, Y, Z, p = T
@@ -124,14 +125,14 @@ def _into_child(T, x):
     return (dot(X, u), dot(Y, u), dot(Z, u)), (dot(X, e), dot(Y, e), dot(Z, e))
 
 
-@compiled
+@inner
 def turned(T, u):
     """Return R u."""
     X, Y, Z, _ = T
     return add(add(scale(u[0], X), scale(u[1], Y)), scale(u[2], Z))
 
 
-@compiled
+@inner
 def _into_parent(T, f):
     """Return a force from the body's frame in its parent's frame: X^-T f."""
     force = turned(T, f[0])
@@ -149,7 +150,7 @@ def place(work, own, joint, q, zero):
         put(work, own + _P + k, joint[27 + k] + joint[30 + k] * angle)
 
 
-@compiled
+@inner
 def move(work, own, up, joint, v, a):
     """Write velocity and acceleration of a body."""
     s = axis(joint)
@@ -162,21 +163,21 @@ def move(work, own, up, joint, v, a):
     put6(work, own + ACCELERATION, A)
 
 
-@compiled
+@inner
 def carry(work, own, seen, to):
     """Write a motion from the parent's frame in the body's frame."""
     T = placement(work, own)
     put6(work, to, _into_child(T, get6(work, seen)))
 
 
-@compiled
+@inner
 def pass_up(work, own, force, to):
     """Add a force on the body to one in its parent's frame."""
     T = placement(work, own)
     gather(work, to, _into_parent(T, get6(work, force)))
 
 
-@compiled
+@inner
 def _momentum(body, x):
     """Return J x from ten inertial parameters: momentum of a velocity, force of an acceleration."""
     m, c = body[0], (body[1], body[2], body[3])
@@ -184,7 +185,7 @@ def _momentum(body, x):
     return add(scale(m, x[0]), cross(x[1], c)), add(cross(c, x[0]), times(J, x[1]))
 
 
-@compiled
+@inner
 def _force(work, own, body, to):
     """Write the force J A + V x* J V on a body."""
     V, A = get6(work, own + VELOCITY), get6(work, own + ACCELERATION)
@@ -192,7 +193,7 @@ def _force(work, own, body, to):
     put6(work, to, f)
 
 
-@compiled
+@inner
 def _give(work, force, joint, to):
     """Write the component of a body's force along its joint."""
     s = axis(joint)
@@ -236,7 +237,7 @@ def mass_matrix(work, tree, bodies, M):
             _join_bodies(work, own, (parents[i] + 1) * BODY)
 
 
-@compiled
+@inner
 def _composite(work, own):
     """Return the ten parameters of the composite of a body and its descendants."""
     at = own + _C
@@ -248,7 +249,7 @@ def _composite(work, own):
     )  # fmt: skip
 
 
-@compiled
+@inner
 def _join_bodies(work, own, up):
     """Add a composite body, in its parent's frame, to the parent's."""
     T = placement(work, own)
@@ -274,7 +275,7 @@ def _join_bodies(work, own, up):
     put3(work, up + _C + 7, add(get3(work, up + _C + 7), (xz, yz, zz)))
 
 
-@compiled
+@inner
 def _change_motion(work, own, up, joint, v, is_first, is_speed):
     """Write the derivatives of a body's motion by a position or speed, its own joint's if first."""
     s = axis(joint)
@@ -293,7 +294,7 @@ def _change_motion(work, own, up, joint, v, is_first, is_speed):
         put6(work, own + _TA, joined(_into_child(T, get6(work, up + _TA)), bent))
 
 
-@compiled
+@inner
 def _change_force(work, own, body):
     """Write the derivative of a body's force from those of its velocity and acceleration."""
     V, TV = get6(work, own + VELOCITY), get6(work, own + _TV)
@@ -303,7 +304,7 @@ def _change_force(work, own, body):
     put6(work, own + _TF, f)
 
 
-@compiled
+@inner
 def _clear(work, at):
     """Write a spatial vector of 0."""
     for k in range(6):
@@ -333,7 +334,7 @@ def derivatives(work, tree, bodies, v, T):
                     pass_up(work, own, own + _TF, up + _TF)
 
 
-@compiled
+@inner
 def _change_bodies(work, tree, bodies, v, k, is_speed):
     """Write the derivatives of the bodies' forces by the position or speed of joint k."""
     for i in range(len(tree.parents)):
@@ -371,7 +372,7 @@ def work_of(bodies, depth):
     return work_space(int(_WORLD) + (bodies + 1) * (FRAME + 12 * depth + 12))
 
 
-@compiled
+@inner
 def _load(work, tree, i, motion, first, last):
     """Write q, v, a of a joint from its coordinate; past the end, those of the last sample."""
     q, v, a, _ = motion
@@ -383,13 +384,13 @@ def _load(work, tree, i, motion, first, last):
         put_lane(work, _MOTION + 2, lane, ratio * a[k, leader])
 
 
-@compiled
+@inner
 def _above(tree, i):
     """Return the number of rows that the parent of a body affects."""
     return tree.depths[tree.parents[i]] if tree.parents[i] >= 0 else 0
 
 
-@compiled
+@inner
 def _follow(work, tree, i, size, motion, first, last):
     """Write placement, velocity, acceleration and axes of a body from those of its parent."""
     own, up = _WORLD + (i + 1) * size, _WORLD + (tree.parents[i] + 1) * size
@@ -413,7 +414,7 @@ def _follow(work, tree, i, size, motion, first, last):
         put6(work, to, s)
 
 
-@compiled
+@inner
 def _share(work, own):
     """Write d, B by columns, dw and the products of w, common to all rows of a body."""
     v, w = get6(work, own + VELOCITY)
@@ -428,7 +429,7 @@ def _share(work, own):
     put3(work, _WW, (xy, xz, yz))
 
 
-@compiled
+@inner
 def _row(work, at):
     """Write the ten columns of one body in one row: m, mc, and I as xx xy yy xz yz zz."""
     u, e = get6(work, at)
@@ -445,7 +446,7 @@ def _row(work, at):
     put(work, _COLUMNS + 9, e[0] * yz - e[1] * xz + e[2] * dw[2])
 
 
-@compiled
+@inner
 def _write(work, out, places, start, stride):
     """Copy the wanted ones of the ten columns to their places in the block."""
     for k in range(10):
@@ -453,7 +454,7 @@ def _write(work, out, places, start, stride):
             write(out, places[k] * stride + start, get(work, _COLUMNS + k))
 
 
-@compiled
+@inner
 def _begin(work, tree):
     """Write the acceleration of the world: the negative of gravity."""
     for k in range(3):
@@ -493,7 +494,7 @@ def finish_rows(values, places, widths, weights, root, out, span):
                 out[column, k] *= root[k]
 
 
-@compiled
+@inner
 def _weigh(work, weights, places, first, last):
     """Write the weights of the ten columns of one body in one row."""
     for k in range(10):
@@ -502,7 +503,7 @@ def _weigh(work, weights, places, first, last):
             put_lane(work, _COLUMNS + k, lane, weight)
 
 
-@compiled
+@inner
 def _pull_row(work, own, at, pull, pulls):
     """Add the adjoints by the ten columns: of an axis, and of the body's motion."""
     u, e = get6(work, at)
@@ -522,7 +523,7 @@ def _pull_row(work, own, at, pull, pulls):
     gather(work, pulls + 6, (by_d, by_dw))
 
 
-@compiled
+@inner
 def _pull_joint(work, own, joint, axes, pull, pulls, above):
     """Write the derivatives by q, v, a of a joint; the adjoints become those of its parent here."""
     s = axis(joint)

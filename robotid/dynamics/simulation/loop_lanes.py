@@ -37,6 +37,7 @@ from robotid.dynamics.kernels.lanes import (
     copysign,
     factor,
     get,
+    inner,
     is_any,
     lane_of,
     pointed,
@@ -71,7 +72,7 @@ _SIGN = 1e-5  # speed over which friction reverses [rad/s or m/s]
 # kinds of sensitivities
 ARMATURE, KP, KD, LIMIT, TERM, DELAY, ZERO, INERTIAL, START, SPEED = range(10)
 
-_bristles = compiled(Bristles.law)
+_bristles = inner(Bristles.law)
 _pointed = cache(pointed)
 
 
@@ -162,7 +163,7 @@ def places_of(n: int, P: int, n_bristles: int, is_held: bool) -> tuple[Places, A
     return at if is_held else at._replace(held=-1), work_space(at.end)
 
 
-@compiled
+@inner
 def _balance(work, at, robot, step, now):
     """Write the residual G of a step's equation for the speeds u, and its derivative H.
 
@@ -213,7 +214,7 @@ def _balance(work, at, robot, step, now):
         put(work, at.loss + i, e)
 
 
-@compiled
+@inner
 def _solve(work, at, robot, step, now):
     """Solve a step for its speeds u and leave the factor of H; return whether it converged."""
     if _newton(work, at, robot, step, now, False):
@@ -226,7 +227,7 @@ def _solve(work, at, robot, step, now):
     return _newton(work, at, robot, step, now, False)
 
 
-@compiled
+@inner
 def _add_fall(work, at, terms):
     """Add to H the slopes of friction that falls with speed, so that it is positive definite."""
     codes, shapes, values, spans, _ = terms
@@ -241,7 +242,7 @@ def _add_fall(work, at, terms):
             put(work, at.H + diagonal, get(work, at.H + diagonal) + fall)
 
 
-@compiled
+@inner
 def _newton(work, at, robot, step, now, is_cautious):
     """Iterate Newton's method for ``_solve``, without falling friction in H if cautious."""
     for k in range(_NEWTON):
@@ -265,7 +266,7 @@ def _newton(work, at, robot, step, now, is_cautious):
     return False
 
 
-@compiled
+@inner
 def _advance(work, at, step):
     """Advance positions and speeds over a solved step."""
     for i in range(at.n):
@@ -274,7 +275,7 @@ def _advance(work, at, step):
         put(work, at.v + i, before + (speed - before) / THETA)
 
 
-@compiled
+@inner
 def _centre(work, at, robot, step, speeds):
     """Write M and h at the midpoint of the step that results from the given speeds."""
     for i in range(at.n):
@@ -286,7 +287,7 @@ def _centre(work, at, robot, step, speeds):
     mass_matrix(work, robot.tree, robot.bodies, at.M)
 
 
-@compiled
+@inner
 def _hold(work, at, columns, drives, now, is_tick):
     """Write the held torques and their sensitivities in lanes whose controllers have a tick."""
     n, P, kinds, sums = at.n, at.P, columns.kinds, columns.sums
@@ -307,7 +308,7 @@ def _hold(work, at, columns, drives, now, is_tick):
             put(work, at.by_hold + i * P + p, own)
 
 
-@compiled
+@inner
 def _presliding(work, at, terms, span):
     """Write the presliding friction after a time at the speeds u, and its derivative."""
     for i in range(2 * at.n):
@@ -320,7 +321,7 @@ def _presliding(work, at, terms, span):
         put(work, grip + at.n, get(work, grip + at.n) + terms.values[k] * z_u)
 
 
-@compiled
+@inner
 def _advance_bristles(work, at, terms, span, step):
     """Write z after a step, the z that acts, and d acting / d before, d after / d u, d before."""
     for slot in range(len(terms.bristles)):
@@ -334,7 +335,7 @@ def _advance_bristles(work, at, terms, span, step):
         put3(work, z + 2, (share, by_speed, by_before))
 
 
-@compiled
+@inner
 def _initialise_bristles(work, at, columns, terms):
     """Write the initial z of ``initial_deflection`` and its derivative by the initial speed v."""
     kinds, sums, P = columns.kinds, columns.sums, at.P
@@ -347,7 +348,7 @@ def _initialise_bristles(work, at, columns, terms):
                 put(work, at.by_state + slot * P + p, z_v)
 
 
-@compiled
+@inner
 def _bristle_column(work, at, terms, p, is_after):
     """Add the effect of bristle states to one column; after the step, advance their columns."""
     for slot in range(len(terms.bristles)):
@@ -362,7 +363,7 @@ def _bristle_column(work, at, terms, p, is_after):
             put(work, at.own + i, get(work, at.own + i) + x)
 
 
-@compiled
+@inner
 def _propagate(work, at, robot, columns, step, now):
     """Advance the sensitivities S of q and v, shape (2n, P), over a solved step."""
     n, P, drives, own = at.n, at.P, robot.drives, at.own
@@ -393,7 +394,7 @@ def _propagate(work, at, robot, columns, step, now):
         _bristle_column(work, at, robot.terms, p, True)
 
 
-@compiled
+@inner
 def _drive_column(work, at, robot, step, now, column):
     """Add the derivative of a step's equation by a parameter of a drive."""
     drives, (codes, shapes, _, spans, bristles) = robot.drives, robot.terms
@@ -421,7 +422,7 @@ def _drive_column(work, at, robot, step, now, column):
     put(work, at.own + j, get(work, at.own + j) + x / get(work, at.loss + j))
 
 
-@compiled
+@inner
 def _combine(work, at, drives, step):
     """Write T_q and T_v of H du = T_v dv - T_q dq - own, each row divided by its e."""
     n, T_q, T_v = at.n, at.T_q, at.T_v
@@ -438,7 +439,7 @@ def _combine(work, at, drives, step):
         put(work, T_q + d, get(work, T_q + d) + by_position)
 
 
-@compiled
+@inner
 def _advance_column(work, at, step, p):
     """Advance one sensitivity of position and speed over a step."""
     n, P, S = at.n, at.P, at.S
@@ -456,7 +457,7 @@ def _advance_column(work, at, step, p):
         put(work, S + (n + i) * P + p, dv + (du - dv) / THETA)
 
 
-@compiled
+@inner
 def _initialise(work, at, robot, columns, start, out_S):
     """Write the initial states of roll-outs and their sensitivities."""
     n, P, kinds, sums = at.n, at.P, columns.kinds, columns.sums
@@ -483,8 +484,7 @@ def roll_out(robot, columns, course, out, work, at, corrects):
     command, steps, ticks, every, start = course
     out_q, out_v = out.q.reshape(out.q.size), out.v.reshape(out.v.size)
     out_S, rows = out.S.reshape(out.S.size), out.S.shape[1]
-    tree, bodies, terms = robot.tree, robot.bodies, robot.terms
-    n, P = at.n, at.P
+    n, P, tree, bodies = at.n, at.P, robot.tree, robot.bodies
     _initialise(work, at, robot, columns, start, out.S)
     commands, starts = command.reshape(command.size), ticks.reshape(ticks.size)
     lengths = steps.reshape(steps.size)
@@ -494,14 +494,11 @@ def roll_out(robot, columns, course, out, work, at, corrects):
             is_tick = read(starts, k * LANES) > 0.0
             if is_any(is_tick):
                 _hold(work, at, columns, robot.drives, now, is_tick)
-        _centre(work, at, robot, step, at.v)
-        if not _solve(work, at, robot, step, now):
-            return k
-        if corrects:
-            _centre(work, at, robot, step, at.u)
+        for solution in range(2 if corrects else 1):
+            _centre(work, at, robot, step, at.u if solution else at.v)
             if not _solve(work, at, robot, step, now):
                 return k
-        _advance_bristles(work, at, terms, THETA * step, step)
+        _advance_bristles(work, at, robot.terms, THETA * step, step)
         if P:
             for i in range(n):
                 moved = get(work, at.u + i) - get(work, at.v + i)
@@ -546,7 +543,7 @@ def _address(law: Law | None, shapes: int) -> int:
     return 0 if law is None else int(_pointed(law, 1 + shapes).address)
 
 
-@compiled
+@inner
 def _law(address, shapes, z, x0, x1, x2, x3):
     """Return the value of a law of a speed or position with its shape parameters, and its slope."""
     if shapes == 0:
@@ -578,7 +575,7 @@ def term(codes, shapes, k, q, u, s, s_u):
     return s * a * b, (s_u * a + s * a_u) * b, s * a * b_q
 
 
-@compiled
+@inner
 def term_by_lane(codes, shapes, k, q, u, s, s_u):
     """Return ``term`` of vectors."""
     y, y_u, y_q = wide(0.0), wide(0.0), wide(0.0)
@@ -591,7 +588,7 @@ def term_by_lane(codes, shapes, k, q, u, s, s_u):
     return y, y_u, y_q
 
 
-@compiled
+@inner
 def affine_term(codes, k, u):
     """Return the regressor of an affine term: the speed, its direction, or 1."""
     if codes[k, 0]:
@@ -616,7 +613,7 @@ def deflection(x, before, u, span):
     return s * g + (before - s * g) * decay, z_u, decay
 
 
-@compiled
+@inner
 def deflection_by_lane(x, before, u, span):
     """Return ``deflection`` of vectors."""
     z, z_u, decay = wide(0.0), wide(0.0), wide(0.0)
@@ -635,7 +632,7 @@ def initial_deflection(x, v, time):
     return s * g, s_v * g + s * g_v
 
 
-@compiled
+@inner
 def initial_deflection_by_lane(x, v, time):
     """Return ``initial_deflection`` of vectors."""
     z, z_v = wide(0.0), wide(0.0)
@@ -645,7 +642,7 @@ def initial_deflection_by_lane(x, v, time):
     return z, z_v
 
 
-@compiled
+@inner
 def loop_torque(drive, error, speed_error, forward):
     """Return the torque that a loop commands, and 1 below its limit, else 0."""
     unlimited, limit = drive[1] * error + drive[2] * speed_error + forward, drive[3]
@@ -653,21 +650,21 @@ def loop_torque(drive, error, speed_error, forward):
     return where(is_free, unlimited, copysign(limit, unlimited)), where(is_free, 1.0, 0.0)
 
 
-@compiled
+@inner
 def read_command(now, i, kind):
     """Return an input of joint i over a step; ``now`` has all inputs and the step's first."""
     inputs, first = now
     return read(inputs, (first + 6 * i + kind) * LANES)
 
 
-@compiled
+@inner
 def by_delay(drive, now, i):
     """Return the derivative of a loop's torque by the delay of its commands, below its limit."""
     by_position = drive[1] * read_command(now, i, 1)
     return by_position + drive[2] * read_command(now, i, 4) + read_command(now, i, 5)
 
 
-@compiled
+@inner
 def by_loop(kind, is_on, error, speed_error, by_delay, torque):
     """Return the derivative of a loop's torque by a gain, its delay or its limit."""
     if kind == KP:
@@ -699,10 +696,9 @@ def average_command(stamps, values, times, delay, mean, change):
 
 
 @compiled
-def divide_rows(stamps, ticks, times, is_tick):
+def divide_rows(stamps, ticks, times, is_tick, edges, shares):
     """Write the ends of the steps: an equal number in each row, none across a tick."""
-    every, i = len(is_tick) // (len(stamps) - 1), 0
-    edges, shares = np.empty(every + 1), np.empty(every, np.int64)
+    every, i = len(shares), 0
     is_tick[:], is_tick[0] = False, True
     for k in range(len(stamps) - 1):
         edges[0], count = stamps[k], 1

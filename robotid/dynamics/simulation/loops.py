@@ -342,7 +342,8 @@ class _Grid:
         """Return the ends of all steps, and which steps start with a tick."""
         size = (len(self.stamps) - 1) * every
         times, is_tick = np.empty(size + 1), np.empty(size, dtype=bool)
-        _lanes().divide_rows(self.stamps, self.ticks, times, is_tick)
+        spare = np.empty(every + 1), np.empty(every, dtype=np.int64)  # edges and shares of a row
+        _lanes().divide_rows(self.stamps, self.ticks, times, is_tick, *spare)
         return times, is_tick
 
 
