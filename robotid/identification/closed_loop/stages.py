@@ -398,8 +398,7 @@ def _initialise_from_commands(task: _Task) -> _Initial:
     top = np.array([max(x.get(joint, 0.0) for x in saturated) for joint in model.joints])
     may_limit = ~is_stated(None if loop.limit == "find" else loop.limit, model)
     top, may_limit = np.where(may_limit, top, 0.0), may_limit & (loop.limit != "find")
-    # positions alone determine only the sum of kd and viscous friction, except at a torque limit,
-    # or with factors of kd that differ between the logs
+    # positions alone determine kd + viscous friction, except at a limit or if kd differs by log
     differs = np.ptp([log.gain_factors[1] for log in logs], axis=0) > 0.0
     finds_kd = differs | uses_torques | all(log.v_ref is not None for log in logs)
     dt = max(float(np.median(np.diff(log.t))) for log in logs)
