@@ -319,7 +319,8 @@ def _watch(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause])
         joint for cause in causes for joint in cause.joints if joint in rows
     ):
         advice.setdefault(found.residual_cause(joint)[1], []).append(joint)
-    why = " ".join(f"{listed(joints)}: {text}." for text, joints in advice.items() if text)
+    of = {text: f"{listed(joints)}: " for text, joints in advice.items() if len(advice) > 1}
+    why = " ".join(f"{of.get(text, '')}{text}." for text in advice if text)
     if not any(joint in rows for joint in found.model.joints):  # no torques were measured
         where = "the base"
         why = "Possible causes: noise of the motion (lower cutoff), an unmeasured force, a delay."
