@@ -354,7 +354,7 @@ def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
         return
     at = max(gaps, key=lambda k: step[k])
     longest, start = float(step[at]), float(log.t[at])
-    severity = "warning" if longest > max(_LONG, GAP_STEPS * median) else "note"
+    severity = "warning" if longest > _LONG else "note"
     yield finding(
         "gap", log.name, severity=severity, gaps=len(gaps), longest=longest, at=start,
         when=seconds(start),

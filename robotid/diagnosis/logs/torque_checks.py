@@ -10,14 +10,13 @@ from robotid.base.tolerances import TINY
 from robotid.base.typing import Array
 from robotid.data.units import STATIC
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import BEYOND_NOISE, NO_ERROR_OF_MASSES, SIGNIFICANT, ZERO
+from robotid.diagnosis.decisions import AGREES, BEYOND_NOISE, NO_ERROR_OF_MASSES, SIGNIFICANT, ZERO
 from robotid.diagnosis.logs.probe import Probe, drive_columns
 from robotid.diagnosis.logs.readings import CERTAIN, EXPLAINED, Best, Samples, best_readings, limbs
 from robotid.robot.model import RobotModel
 
 _UNEXPLAINED = 0.25  # unexplained share of a torque's variance that is reported, not accepted
 _SPREAD = 0.3  # prior standard deviation of a link's mass, relative to the URDF's
-_PRECISION = 0.05  # of a torque, model errors included
 _INDEPENDENT, _PER_SECOND = 20.0, 3.0  # independent instants of a log, per second of a short one
 _WORSE = 0.25  # allowed increase of a torque's misfit over its own fit, in variances
 _OTHER_UNIT = 30.0  # a common scale of all torques farther from 1 is another unit, no gain
@@ -213,12 +212,12 @@ def load_model(probe: Probe, share: Array) -> LoadModel:
         U, s, _ = np.linalg.svd(drive / np.where(length > 0, length, 1.0), full_matrices=False)
         Q = U[:, s > TINY * s[0]]
         left = X[:, j] - Q @ (Q.T @ X[:, j])
-        sigma = np.sqrt(_PRECISION**2 + share[j]) * level[j]
+        sigma = np.sqrt(AGREES**2 + share[j]) * level[j]
         R[j] = np.linalg.qr(left * np.sqrt(independent / N) / sigma, mode="r")
     mean = np.append(np.ones(bodies), np.zeros(4))
     arm = _mass(probe.model)  # a payload is of its size
     spread = np.append(np.full(bodies, _SPREAD), [arm, *[arm * probe.model.length] * 3])
-    expected = independent * float((share / (_PRECISION**2 + share))[used].sum())
+    expected = independent * float((share / (AGREES**2 + share))[used].sum())
     return LoadModel(R, mean, spread, expected, independent * float(used.sum()))
 
 
@@ -258,10 +257,6 @@ def _is_compensated(probe: Probe) -> bool:
     return load_model(whole.probe, whole.share).is_this_robot()
 
 
-def _mass(model: RobotModel) -> float:
-    return float(model.standard_parameters()[: model.layout.n_inertial : 10].sum())
-
-
 def _error_of_links(theta: Array) -> float:
     return float(np.sum(((theta[:-4] - 1.0) / _SPREAD) ** 2))
 
@@ -285,3 +280,7 @@ def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Fin
         severity="warning" if abs(mass) - 2 * error > _LARGE * _mass(probe.model) else "note",
         mass=mass, std_error=error, mcx=load[1], mcy=load[2], mcz=load[3],
     )  # fmt: skip
+
+
+def _mass(model: RobotModel) -> float:
+    return float(model.standard_parameters()[: model.layout.n_inertial : 10].sum())

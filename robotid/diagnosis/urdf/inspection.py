@@ -97,9 +97,13 @@ def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
     try:
         model = RobotModel.from_urdf(path, free_flyer=free_flyer)
     except ModelError as error:
-        findings.append(finding("unusable", subject=where, text=str(error)))
+        fault = str(error).partition(": ")[2]  # behind the name of the file
+        if not any(fault in one.message for one in findings):
+            findings.append(finding("unusable", subject=where, text=str(error)))
     if name:
-        findings += _joint_findings(Path(path))
+        is_named = any(one.code == "not_a_number" for one in findings)
+        of_joints = _joint_findings(Path(path))
+        findings += [x for x in of_joints if not (is_named and x.code == "yourdfpy_refuses")]
     if model is None:
         movable = [j.get("name", "") for j in robot.findall("joint") if j.get("type") in MOVABLE]
         return Inspection(name, tuple(movable), None, (), tuple(findings))
