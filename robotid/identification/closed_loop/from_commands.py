@@ -273,8 +273,7 @@ def _others(model: RobotModel, loop: LoopSettings, fitted: Fitted) -> dict[str, 
 def with_gravity(model: RobotModel, log: Log) -> Log:
     """Return a log with the URDF's gravity torque at the measured position added to tau_ref."""
     torque = predict_instants(model, model.standard_parameters(), log.q)
-    fed = torque if log.tau_ref is None else log.tau_ref + torque
-    return replace(log, tau_ref=fed)
+    return replace(log, tau_ref=torque if log.tau_ref is None else log.tau_ref + torque)
 
 
 def driven_log(model: RobotModel, log: Log, signals: SignalSettings) -> Log:

@@ -613,8 +613,7 @@ def _gains(
     H: Array, g: Array, columns: list[int], sets: dict[int, list[int]], least: Array
 ) -> dict[int, Array]:
     """Return by how much each set of further columns lowers the squares of each held-out fold."""
-    # 0 if the least step is smaller than the bound allows, (c,); all 0 if the other folds do not
-    # determine a parameter, as with short logs
+    # 0 for a step below ``least``, (c,); all 0 if the other folds do not determine a parameter
     gains = {s: np.zeros(len(H)) for s in sets}
     base = np.array(columns)
     for k, (H_k, g_k) in enumerate(zip(H, g, strict=True)):
