@@ -632,7 +632,7 @@ def one_run(name, rng, seconds, *, finds_all=False, torque=False):
         plant, drawn = with_drawn_bodies(plant, rng, settings.bodies)
         truth |= drawn
     log = plant_log(plant, rng, seconds, torque=torque)
-    gains = {key: {d.joint: getattr(d, key) for d in plant.drives} for key in ("kp", "kd")}
+    gains = plant.gains
     first = plant.model.joints[0]
     gains = {} if finds_all else gains
     # every joint has a drive of its own
@@ -658,7 +658,7 @@ def held_run(name, rng, seconds, *, bits):
     turn = 2 * np.pi / 2**bits
     q = turn * np.round(q / turn)
     log = Log(t, q, 0 * q, plant.model.joints, q_ref=q_ref, has_torque=False)
-    gains = {key: {d.joint: getattr(d, key) for d in plant.drives} for key in ("kp", "kd")}
+    gains = plant.gains
     first = plant.model.joints[0]
     loop = LoopSettings(**gains, groups={first: [first]})
     settings = SimulationSettings(bodies=0.0)

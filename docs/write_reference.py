@@ -20,7 +20,7 @@ from robotid.data.signal_settings import (
 from robotid.diagnosis.catalogue import entries
 from robotid.dynamics.simulation.simulation_settings import Simulation
 from robotid.estimation.fitting.estimator_settings import ESTIMATORS, ConstraintSettings
-from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.closed_loop.loop_settings import LogGains, LoopSettings
 from robotid.robot.constraints import Contact, Loop
 from robotid.robot.drives import AUTO, TERMS
 from robotid.robot.parameters import Coupling
@@ -96,6 +96,7 @@ TABLES = {
     "[contact]": Contact,
     "[loop]": Loop,
     "[identification]": LogEntry,
+    "identification.controller": LogGains,
     "[payload_check]": PayloadEntry,
 }
 #: The page of a table that is not on that of the job file.
@@ -362,6 +363,8 @@ def default_of(field):
     words = {True: "true", False: "false"} if isinstance(value, bool) else {}
     if isinstance(value, str):
         return f'`"{value}"`'
+    if isinstance(value, LogGains):
+        return "-"
     if isinstance(value, tuple):
         return f"`{list(value)}`"
     return "`{}`" if isinstance(value, dict) else f"`{words.get(value, value)}`"

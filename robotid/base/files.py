@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import tempfile
+import tomllib
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
@@ -215,6 +216,24 @@ def write_json(content: Mapping[str, Any], target: str | Path) -> None:
 def finite(value: float) -> float | None:
     """Return a number for JSON: None if it is not finite."""
     return float(value) if math.isfinite(value) else None
+
+
+def read_toml(path: Path, what: str) -> dict[str, Any]:
+    """Return the tables of a TOML file, which errors describe as ``what``."""
+    check_path(path)
+    if not path.is_file():
+        raise SettingsError(missing_file(path, what))
+    try:
+        return tomllib.loads(text := path.read_text(encoding="utf-8-sig"))
+    except tomllib.TOMLDecodeError as error:
+        at = re.search(r"at line (\d+)", str(error))
+        line = ": " + text.split("\n")[int(at[1]) - 1].strip()[:80] if at else ""
+        raise SettingsError(
+            f"{path.name} is not valid TOML: {error}{line}. Text and paths need quotes; a key or "
+            "[table] occurs once"
+        ) from error
+    except (ValueError, RecursionError) as error:  # not UTF-8, numbers too long, tables too deep
+        raise SettingsError(f"{path.name} is not valid TOML: {error}") from error
 
 
 def missing_file(path: Path, what: str) -> str:

@@ -2,16 +2,14 @@
 
 import argparse
 import os
-import re
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field
+from dataclasses import MISSING, dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robotid.base.exceptions import SettingsError
-from robotid.base.files import check_path, missing_file
+from robotid.base.files import check_path, read_toml
 from robotid.base.findings import listed
 from robotid.base.settings import (
     POSITIVE,
@@ -43,7 +41,7 @@ from robotid.estimation.fitting.estimator_settings import (
     EstimatorSettings,
     SimulationSettings,
 )
-from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.closed_loop.loop_settings import LogGains, LoopSettings
 from robotid.robot.constraints import Contact, Loop
 from robotid.robot.drive_term import DriveTerm
 from robotid.robot.drives import AUTO, DRIVE_TERMS, FAMILIES, TERMS, term_from_dict
@@ -116,6 +114,10 @@ class LogEntry(Settings):
     unit: str | None = setting(
         None, "name of the robot, if the logs are of several robots of one kind, as 'arm-07'"
     )
+    controller: LogGains = setting(
+        LogGains(), "gains that differ from [controller]",
+        dump=lambda gains: gains.to_dict() or None,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -248,8 +250,9 @@ class Job(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_transmissions(self.transmissions, self.joints)
-        is_looped = isinstance(self.estimator, SimulationSettings)
-        if self.controller != LoopSettings() and not is_looped:
+        gains = [entry.controller for entry in (*self.identification, *self.validation)]
+        is_stated = self.controller != LoopSettings() or any(x != LogGains() for x in gains)
+        if is_stated and not isinstance(self.estimator, SimulationSettings):
             raise SettingsError(
                 f"[controller] is given, but the estimator is {self.estimator.name!r}, expected "
                 "'simulation'; set [estimator] name = 'simulation', or remove [controller]"
@@ -298,7 +301,10 @@ class Job(Settings):
     def read(self, entry: LogEntry, model: "RobotModel", *, needs: Needs = "torque") -> Log:
         """Return one log of the job, of the model's joints in its order."""
         stated = self._reading(model) | {"start": entry.start, "end": entry.end}
-        return read_log(entry.path, needs=needs, **stated)
+        log = read_log(entry.path, needs=needs, **stated)
+        if entry.controller == LogGains():
+            return log
+        return replace(log, gain_factors=entry.controller.factors(self.controller, log.joints))
 
     def lay_out(
         self, entry: LogEntry, model: "RobotModel", *, needs: Needs = "torque"
@@ -318,21 +324,8 @@ class Job(Settings):
 
 def read_job(path: str | Path) -> Job:
     require_kind(path, (str, Path), "path", "the path of a job file")
-    check_path(path)
-    if not (source := Path(path)).is_file():
-        raise SettingsError(missing_file(source, "job file"))
-    try:
-        table = tomllib.loads(text := source.read_text(encoding="utf-8-sig"))
-    except tomllib.TOMLDecodeError as error:
-        at = re.search(r"at line (\d+)", str(error))
-        line = ": " + text.split("\n")[int(at[1]) - 1].strip()[:80] if at else ""
-        raise SettingsError(
-            f"{source.name} is not valid TOML: {error}{line}. Text and paths need quotes; a key "
-            "or [table] occurs once"
-        ) from error
-    except (ValueError, RecursionError) as error:  # not UTF-8, numbers too long, tables too deep
-        raise SettingsError(f"{source.name} is not valid TOML: {error}") from error
-    return job_from_settings(table, source.name, source.parent, expand=True)
+    source = Path(path)
+    return job_from_settings(read_toml(source, "job file"), source.name, source.parent, expand=True)
 
 
 def job_file(model: object) -> Job:

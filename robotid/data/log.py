@@ -72,6 +72,8 @@ class Log:
         contacts: Whether links touch the ground, by link, each of shape (N,), bool.
         wrenches: Measured components of the wrenches of the ground, by name as "fz l_sole", each of
             shape (N,) [N or N m].
+        gain_factors: Gains kp and kd of the drives in this log over those of their controller,
+            positive, shape (2, n) [-]; 1 by default.
     """
 
     t: Array
@@ -90,6 +92,7 @@ class Log:
     contacts: Mapping[str, Array] = field(default_factory=dict)
     wrenches: Mapping[str, Array] = field(default_factory=dict)
     assumed: tuple[str, ...] = ()
+    gain_factors: Array = field(default_factory=lambda: np.ones((2, 1)))
 
     def __post_init__(self) -> None:
         require_kind(self.path, (str, Path), "path", "the path of the log's file, or ''")
@@ -102,6 +105,10 @@ class Log:
                 f"{where}: has_torque is False, but tau is not 0; leave has_torque out, or pass "
                 "zeros"
             )
+        factors, shape = real_numbers(self.gain_factors, "gain_factors"), (2, len(self.joints))
+        if factors.shape not in ((2, 1), shape) or not (factors > 0.0).all():
+            raise DataError(f"{where}: gain_factors is not positive, of shape {shape}: {factors}")
+        object.__setattr__(self, "gain_factors", frozen(np.broadcast_to(factors, shape)))
         if len(self.t) < 2:
             raise DataError(f"{where} has {len(self.t)} rows, expected at least 2; record longer")
         require_increasing(self.t, where)
@@ -175,7 +182,8 @@ class Log:
                 )
         columns = [self.joints.index(name) for name in joints]
         chosen = {name: x[:, columns] for name, x in self._arrays().items()}
-        return replace(self, joints=tuple(joints), **chosen)
+        factors = self.gain_factors[:, columns]
+        return replace(self, joints=tuple(joints), gain_factors=factors, **chosen)
 
     def turned(self, sign: Array) -> "Log":
         """Return the log with the signs of some joints reversed.

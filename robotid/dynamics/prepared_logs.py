@@ -78,7 +78,7 @@ def _with_passive(model: RobotModel, log: Log) -> Log:
         note += f"; {listed(unused)} are not used, since these joints have none"
     return replace(
         log, joints=model.joints, q=q, tau=tau, v=None, a=None, q_ref=None, v_ref=None,
-        tau_ref=None, notes=(*log.notes, note),
+        tau_ref=None, gain_factors=np.ones((2, 1)), notes=(*log.notes, note),
     )  # fmt: skip
 
 

@@ -289,6 +289,28 @@ class RowPlan(NamedTuple):
     first: Array  # first place of each row, and the end, shape (n + 1,), int
 
 
+class _Sources(NamedTuple):
+    """Where Pinocchio's regressor has the inertial columns of a block of rows."""
+
+    wanted: Array  # entries of the flat regressor, int
+    parts: list[tuple[Array | slice, float, slice, bool]]  # places, ratio, entries, whether added
+    G: Array | None  # Pinocchio's speeds by those of the joints; None if they are the same
+
+    @classmethod
+    def of(cls, model: RobotModel, plan: RowPlan) -> "_Sources":
+        """Return the sources of a plan."""
+        G, size = model.velocity_map, 10 * (model.pin_model.njoints - 1)
+        is_same = np.array_equal(G, np.eye(model.pin_model.nv))
+        # tau = G^T tau_pinocchio: row j is the sum of the Pinocchio rows that its joint moves
+        wanted, parts, end = [], [], 0
+        for j, (columns, places) in enumerate(zip(plan.inertial, plan.places, strict=True)):
+            for k, r in enumerate(np.array([j]) if is_same else np.flatnonzero(G[:, j])):
+                wanted.append(size * r + columns)
+                part = slice(end, end := end + len(columns))
+                parts.append((_as_slice(places), G[r, j], part, k > 0))
+        return cls(np.concatenate(wanted), parts, None if is_same else G)
+
+
 def plan_rows(layout: ParameterLayout, columns: Sequence[Array]) -> RowPlan:
     """Return the plan of a block of rows: each row's columns in that order, then its torque."""
     loads, size = layout.drive_loads, layout.n_inertial
@@ -336,9 +358,9 @@ class InertialRows:
 
 def inertial_rows(model: RobotModel, q: Array, v: Array, a: Array) -> InertialRows:
     """Return the inertial columns that affect each row; of many joints they are few."""
-    plan = _inertial_plan(model)
+    plan, sources = _inertial_plan(model)
     out = np.empty((plan.first[-1], min(BLOCK, len(q))))
-    writer, places = _PinocchioWriter(model, plan, out), np.concatenate(plan.places)
+    writer, places = _PinocchioWriter(model, plan, out, sources), np.concatenate(plan.places)
     values = np.empty((len(places), len(q)))
     for start in range(0, len(q), BLOCK):
         k = slice(start, min(start + BLOCK, len(q)))
@@ -359,9 +381,10 @@ def keep_inertial_rows(model: RobotModel, trajectory: Trajectory) -> None:
 
 
 @lru_cache(maxsize=2)  # for many short motions of one robot
-def _inertial_plan(model: RobotModel) -> RowPlan:
-    """Return the plan of rows with inertial columns alone."""
-    return plan_rows(model.layout, _inertial_support(model))
+def _inertial_plan(model: RobotModel) -> tuple[RowPlan, _Sources]:
+    """Return the plan of rows with inertial columns alone, and their sources."""
+    plan = plan_rows(model.layout, _inertial_support(model))
+    return plan, _Sources.of(model, plan)
 
 
 def _inertial_support(model: RobotModel) -> tuple[Array, ...]:
@@ -414,7 +437,9 @@ class TrajectoryRows(RowSource):
         writer = (
             _CompiledWriter(self.model, self._tree, plan, out)
             if self.engine == COMPILED
-            else _PinocchioWriter(self.model, plan, out, self.inertial)
+            else _PinocchioWriter(
+                self.model, plan, out, _Sources.of(self.model, plan), self.inertial
+            )
         )
         for first in range(start, stop, _LOADED * length):
             last = min(first + _LOADED * length, stop)
@@ -459,10 +484,10 @@ class _PinocchioWriter:
     """Writes inertial columns: stored ones, or by Pinocchio's function, sample by sample."""
 
     def __init__(
-        self, model: RobotModel, plan: RowPlan, out: Array, inertial: InertialRows | None = None
-    ) -> None:
-        G, nv = model.velocity_map, model.pin_model.nv
-        self._model, self._plan, self._out = model, plan, out
+        self, model: RobotModel, plan: RowPlan, out: Array, sources: _Sources,
+        inertial: InertialRows | None = None,
+    ) -> None:  # fmt: skip
+        self._model, self._plan, self._out, self._sources = model, plan, out, sources
         self._stored: Array | None = None
         if inertial is not None:
             own = zip(inertial.first, inertial.columns, plan.inertial, strict=False)
@@ -470,18 +495,7 @@ class _PinocchioWriter:
             self._from = np.concatenate([i + np.searchsorted(x, wanted) for i, x, wanted in own])
             self._to = _as_slice(np.concatenate(plan.places))
         self._data = model.pin_model.createData()
-        size = 10 * (model.pin_model.njoints - 1)
-        self._map = None if np.array_equal(G, np.eye(nv)) else G
-        # tau = G^T tau_pinocchio: row j is the sum of the Pinocchio rows that its joint moves
-        wanted, end = [], 0
-        self._sources: list[tuple[Array | slice, float, slice, bool]] = []
-        for j, (columns, places) in enumerate(zip(plan.inertial, plan.places, strict=True)):
-            for k, r in enumerate(np.array([j]) if self._map is None else np.flatnonzero(G[:, j])):
-                wanted.append(size * r + columns)
-                part = slice(end, end := end + len(columns))
-                self._sources.append((_as_slice(places), G[r, j], part, k > 0))
-        self._wanted = np.concatenate(wanted)
-        self._raw = np.empty((out.shape[1], end))
+        self._raw = np.empty((out.shape[1], len(sources.wanted)))
 
     def load(self, motion: Trajectory, part: slice, values: Array, weights: Array | None) -> None:
         """Load the samples of the next blocks, and their drive columns."""
@@ -506,15 +520,15 @@ class _PinocchioWriter:
     def write_inertial(self, q: Array, v: Array, a: Array) -> None:
         """Write the inertial columns of some samples at the beginning of the block."""
         regressor, model, data = pin.computeJointTorqueRegressor, self._model.pin_model, self._data
-        wanted = self._wanted
-        if self._map is not None:
-            v, a = v @ self._map.T, a @ self._map.T
+        wanted, parts, G = self._sources
+        if G is not None:
+            v, a = v @ G.T, a @ G.T
         x = np.ascontiguousarray(self._model.configurations(q))
         for raw_k, q_k, v_k, a_k in zip(self._raw, x, v, a, strict=False):
             # only the wanted entries, while the regressor is in the cache; without bound checks
             regressor(model, data, q_k, v_k, a_k).take(wanted, None, raw_k, "clip")
         out, raw = self._out[:, : len(q)], self._raw[: len(q)].T
-        for places, ratio, part, is_added in self._sources:
+        for places, ratio, part, is_added in parts:
             values = raw[part] if ratio == 1.0 else ratio * raw[part]
             out[places] = out[places] + values if is_added else values
 

@@ -195,14 +195,16 @@ class TorqueIdentification(Identification, Fit):
             self.determination.undetermined, self.is_consistent, self.is_poorly_excited,
             model.is_static, [name for name in by_prior if name not in self.undetermined],
         )  # fmt: skip
-        # not of long logs, of which only parts are in memory, and not of projected rows, whose
-        # torques are not those of joints
-        has_cause = not (model.constraints or any(x.is_partial for x in recordings))
         return judge(
             predictions, determined, log_errors=self.log_errors, warnings=self.warnings,
-            scale_check=self.scale_check, cause_of=self._cause_of if has_cause else None,
+            scale_check=self.scale_check, cause_of=self.residual_cause,
         )  # fmt: skip
 
-    def _cause_of(self, joint: str) -> tuple[str, str]:
-        """Return the cause of a joint's residual, and what to do."""
+    def residual_cause(self, joint: str) -> tuple[str, str]:
+        """Return the cause of a joint's residual, and what to do; empty if it is not known."""
+        # not of long logs, of which only parts are in memory, and not of projected rows, whose
+        # torques are not those of joints
+        recordings = [e.recording for e in (*self.fitted, *self.validation)]
+        if self.model.constraints or any(x.is_partial for x in recordings):
+            return "", ""
         return self.joint_torques[self.model.row_names.index(joint)].cause

@@ -1,10 +1,17 @@
+import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+from helpers.paths import URDF
+from helpers.synthetic import sine_log
 
 from robotid.base.exceptions import SettingsError
-from robotid.cli.job import Job, job_from_settings, read_job
+from robotid.cli.job import Job, LogEntry, job_from_settings, read_job
+from robotid.data.files.read import write_log
 from robotid.data.signal_settings import LogSource
+from robotid.estimation.fitting.estimator_settings import SimulationSettings
+from robotid.identification.closed_loop.loop_settings import LogGains, LoopSettings
 from robotid.robot.constraints import Loop
 from robotid.robot.parameters import Coupling
 
@@ -162,6 +169,8 @@ WRONG = {
                  "a [[transmission]] has no key 'joints'"),
     "term in lists": ("[estimator]", "[drives]\nj1 = [[]]\n[estimator]",
                       "a drive term is [], expected a table, for example { term = 'Stribeck'"),
+    "gains of a log": ("start = 0.3", "controller = { kp = 2.0 }", "[controller] is given, but"),
+    "gain of a log": ("start = 0.3", "controller = { ki = 2.0 }", "controller.ki is not a known"),
     "group": ('"wls"', '"simulation"\n[controller]\ngroups = { a = "j1" }',
               "groups.a is 'j1', expected a list"),
     "step": ('"wls"', '"simulation"\nstep = 1e-9', "step is 1e-09, expected 2e-5 to 0.1"),
@@ -205,6 +214,25 @@ def test_a_controller_that_the_estimator_does_not_read_is_refused(tmp_path):
     assert job.to_dict()["controller"]["kp"] == 20.0
     del table["controller"]
     assert "controller" not in job_from_settings(table, "job.toml", tmp_path).to_dict()
+
+
+def test_a_log_has_its_own_gains(tmp_path):
+    gains, path = LogGains(kp={"joint_2": 60.0}, kd=0.8), tmp_path / "a.csv"
+    write_log(sine_log(joints=("joint_1", "joint_2"), q_ref=np.zeros((60, 2))), path)
+    job = Job(
+        URDF / "planar_2r.urdf", estimator=SimulationSettings(), controller=LoopSettings(kp=20.0),
+        identification=(LogEntry(path, controller=gains),),
+    )  # fmt: skip
+    assert job_from_settings(job.to_dict(), "job.toml", tmp_path) == job
+    factors = job.read(job.identification[0], job.model(), needs="commands").gain_factors
+    assert factors.tolist() == [[1.0, 3.0], [0.8, 0.8]]
+    for common, words in (
+        (LoopSettings(kp=1.0, kd=0.0), "kd is 0.8, but [controller] has kd = 0"),
+        (LoopSettings("torque"), "[controller] has kind 'torque', which no gain of a log changes"),
+        (LoopSettings(kp={"j": 1.0}), "controller: kp is given for 'j', which is not a moving"),
+    ):
+        with pytest.raises(SettingsError, match=re.escape(words)):
+            gains.factors(common, ("joint_1", "joint_2"))
 
 
 def test_friction_that_is_stated_as_selected_is_the_default():

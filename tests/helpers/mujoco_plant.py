@@ -56,6 +56,10 @@ class Plant:
         }
 
     @property
+    def gains(self) -> dict[str, dict[str, float]]:
+        return {key: {d.joint: getattr(d, key) for d in self.drives} for key in ("kp", "kd")}
+
+    @property
     def parameters(self) -> np.ndarray:
         """The standard parameters of the URDF's bodies and of the drives."""
         pi, names = self.model.standard_parameters(), self.model.layout.names
@@ -80,6 +84,13 @@ def plant(name, rng, **changes):
         )  # fmt: skip
         drives.append(replace(drive, **changes))
     return Plant(model, tuple(drives), np.array(middle), np.array(reach))
+
+
+def assert_recovered(estimate, truth, within=3.3, certain=0.15):
+    """Parameters are within so many errors of the truth by name, and errors a share of it."""
+    for name, value, error in zip(estimate.names, estimate.theta, estimate.std_error, strict=True):
+        assert abs(value - truth[name]) < within * error, name
+        assert not truth[name] or error < certain * truth[name], name  # an offset is 0
 
 
 def recorded(

@@ -144,7 +144,7 @@ def read_logs(
     else:
         raise _no_log(given)
     return tuple(
-        _of_joints(log, joints, "motion" if log.wrenches else needs, passive)
+        _of_joints(log, joints, "motion" if log.wrenches and needs == "torque" else needs, passive)
         if isinstance(log, Log)
         else read_log(
             log, joints, prismatic=prismatic, needs=needs, base=base, passive=passive, robot=robot

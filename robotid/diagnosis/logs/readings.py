@@ -97,7 +97,8 @@ class _Motion:
         every = drive_columns(self.model, self.q, self.v[:, -k:], self.a[:, -k:])
         level = np.sqrt(np.mean(self.tau**2, axis=0).max())
         every *= level / (np.sqrt(np.mean(every**2, axis=0)) + EXACT)
-        drive = np.pad(every, ((0, 0), (n - k, 0), (0, 0)))
+        drive = np.zeros((N, n, every.shape[2]))
+        drive[:, n - k :] = every
         coupled, drive = drive[:, reach, _DRIVE:], drive[:, rows, :_DRIVE]
         bodies = (X * self.spread[self.moved])[..., self.spread[self.moved] > 0.0]
         logged = np.repeat(self.tau[:, None], len(rows), axis=1)
@@ -106,7 +107,7 @@ class _Motion:
             logged = self.tau[:, None] * np.eye(n)
         P = np.concatenate([bodies, coupled, drive, urdf[..., None], logged], axis=2)
         P = (P if self.basis is None else without_forces(self.basis, P)[:, rows]).swapaxes(0, 1)
-        edges = np.linspace(0, N, self.segments + 1).astype(int).tolist()
+        edges = [i * N // self.segments for i in range(self.segments + 1)]
         parts = [P[:, i:k] for i, k in pairwise(edges)]
         return np.array([part.swapaxes(1, 2) @ part for part in parts])  # (K, m, c, c)
 

@@ -68,6 +68,9 @@ class JointTorque:
     quantities: Mapping[str, tuple[str, Array]]
     #: Share of the squared residual above the filter's cut-off, or white; None if not available.
     broadband: float | None
+    #: Share of the squared residual above a frequency [Hz] where the torque has half of it at most.
+    beyond: float = 0.0
+    frequency: float = np.inf
     fitted: JointTorque | None = None  # of the fitted recordings; None if it is of them itself
 
     @cached_property
@@ -142,22 +145,25 @@ class JointTorque:
         name, where = ("", 0.0) if best is None else (best.name, best.where)
         sizes = [0.0] if best is None else np.abs(best.centres)
         is_slow = name == "speed" and abs(where) < float(np.median(sizes))
-        quick = self.broadband or 0.0
+        quick, frequency = self.broadband or 0.0, self.frequency
         kinds = {
             "unused": bool(np.isnan(rms["measured"])),
             "zero": rms["measured"] == 0,
             "constant": name == "constant",
             "quantity": best is not None,
             "short": self.broadband is None or self.rows.segments is None,
+            "beyond": self.beyond >= decisions.MISFIT_WARNS,
             "noise": quick >= 1.0 - quick,
             "slow": True,
         }
         kind = next(kind for kind, holds in kinds.items() if holds)
-        share = {"noise": quick, "slow": 1.0 - quick}.get(kind, (best and best.share) or 0.0)
+        shares = {"beyond": self.beyond, "noise": quick, "slow": 1.0 - quick}
+        share = shares.get(kind, (best and best.share) or 0.0)
         cause = sentence_of(
             "residual:cause", what=kind, left=_percent(rms["residual"] / (rms["measured"] or 1.0)),
             share=_percent(share), name=name, unit=self.unit if best is None else best.unit,
             size=0.0 if best is None else best.means[0], low=is_slow, where=where,
+            frequency=frequency,
             names=", ".join(d.name for d in self.follows if d.name != "constant"),
         )  # fmt: skip
         before = () if self.fitted is None else self.fitted.follows
@@ -166,7 +172,7 @@ class JointTorque:
             d.name == name and d.share is not None and not d.is_significant for d in before
         )
         what = "changed" if name and has_changed else name or kind
-        return cause, sentence_of("residual:advice", what=what)
+        return cause, sentence_of("residual:advice", what=what, frequency=frequency)
 
 
 def joint_torques(fit: Fit) -> tuple[JointTorque, ...]:
@@ -194,6 +200,7 @@ def _torques_of(fit: Fit, evaluations: Sequence[Evaluation]) -> tuple[JointTorqu
     )
     load = np.concatenate([s.load for s in splits])
     rows, broadband = _rows(chosen), _broadband_shares(evaluations)
+    frequency, beyond = _beyond_torque(evaluations)
     judged = []
     for j, joint in enumerate(model.row_names):
         terms = [split.terms_of(j) for split in splits]  # equal in all
@@ -214,7 +221,7 @@ def _torques_of(fit: Fit, evaluations: Sequence[Evaluation]) -> tuple[JointTorqu
         judged.append(
             JointTorque(
                 joint, model.row_units[j], rows, used[:, j], tau[:, j], parts, by_part, quantities,
-                broadband[j],
+                broadband[j], float(beyond[j]), frequency,
             )
         )  # fmt: skip
     return tuple(judged)
@@ -261,6 +268,36 @@ def _broadband_shares(evaluations: Sequence[Evaluation]) -> list[float | None]:
         min(1.0, 1.0 - product / square) if square > 0 else None
         for product, square in zip(products.tolist(), squares.tolist(), strict=True)
     ]
+
+
+def _beyond_torque(evaluations: Sequence[Evaluation]) -> tuple[float, Array]:
+    """Return a frequency [Hz] above which a residual has clearly more power than its torque.
+
+    It is the highest one of all rows; with it the share of each row's squared residual from there
+    to the filter's cut-off, which is 0 if the torque is not that small. Of the longest segment.
+    """
+    _, e, k = max(
+        ((np.ptp(motion.t[k]), e, k)
+         for e in evaluations for motion in [e.recording.trajectory]
+         for k in np.split(np.arange(len(motion.t)), np.flatnonzero(np.diff(motion.segment)) + 1)),
+        key=lambda part: part[0],
+    )  # fmt: skip
+    motion, cutoff = e.recording.trajectory, e.recording.signals.cutoff
+    if cutoff is None or motion.rate is None:
+        return np.inf, np.zeros(motion.tau.shape[1])
+    both = np.stack([motion.tau, motion.tau - e.torques["estimate"]])[:, k]
+    both = (both - both.mean(axis=1, keepdims=True)) * np.hanning(len(k))[:, None]
+    powers, f = np.abs(np.fft.rfft(both, axis=1)) ** 2, np.fft.rfftfreq(len(k), 1 / motion.rate)
+    above = np.cumsum(powers[:, f < cutoff][:, ::-1], axis=1)[:, ::-1]  # each frequency
+    excess, share = (
+        above[1] - above[0] / decisions.BETTER,
+        above[1] / np.maximum(above[1, 0], decisions.NOTHING),
+    )
+    share[excess <= 0] = 0.0
+    best = np.argmax(excess, axis=0)
+    counts = np.take_along_axis(share, best[None], 0)[0] >= decisions.MISFIT_WARNS
+    first = int(best[counts].max(initial=0))
+    return float(f[first]), share[first]
 
 
 def _percent(share: float) -> str:

@@ -329,7 +329,7 @@ class Verdict:
 def judge(
     predictions: Predictions, determined: Determined, *, log_errors: Sequence[str] = (),
     warnings: Sequence[VerdictWarning] = (), scale_check: ScaleCheck | None = None,
-    cause_of: Callable[[str], tuple[str, str]] | None = None,
+    cause_of: Callable[[str], tuple[str, str]] = lambda joint: ("", ""),
 ) -> Verdict:  # fmt: skip
     """Return the verdict on a result."""
     evidence, hidden = predictions.on_each(), predictions.hidden
@@ -370,8 +370,7 @@ def judge(
         for joint, one in evidence.items()
     }
     per_joint |= {joint: JointVerdict("not evaluated", (unseen,)) for joint in hidden}
-    if cause_of is not None:
-        _explain_largest_error(per_joint, evidence, cause_of)
+    _explain_largest_error(per_joint, evidence, cause_of)
     errors = {joint: max(one.errors, default=0.0) for joint, one in evidence.items()}
     largest_error, logs = max(errors.values(), default=0.0), logs_that_test(predictions.validation)
     good = sentence_of("verdict:good", what="torque", logs=logs, error=largest_error)
@@ -401,9 +400,9 @@ def _explain_largest_error(
     if not good:
         return
     last = max(good, key=lambda joint: max(evidence[joint].errors))
-    cause, advice = cause_of(last)
-    text = f"largest error of the good joints: {'. '.join(filter(None, (cause, advice)))}"
-    per_joint[last] = replace(per_joint[last], reasons=(*per_joint[last].reasons, text))
+    if cause := ". ".join(filter(None, cause_of(last))):
+        text = f"largest error of the good joints: {cause}"
+        per_joint[last] = replace(per_joint[last], reasons=(*per_joint[last].reasons, text))
 
 
 def concluded(

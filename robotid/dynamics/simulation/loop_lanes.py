@@ -103,6 +103,7 @@ class Columns(NamedTuple):
     kinds: Array  # kind, joint and index of each column, shape (C, 3), int
     sums: Array  # first column of each of the P sums that are sensitivities, and end, (P + 1,), int
     directions: Array  # directions in a body's ten parameters, shape (D, 10)
+    factors: Array  # derivative of each column's quantity by its parameter, shape (C,)
 
 
 class Course(NamedTuple):
@@ -290,7 +291,7 @@ def _centre(work, at, robot, step, speeds):
 @inner
 def _hold(work, at, columns, drives, now, is_tick):
     """Write the held torques and their sensitivities in lanes whose controllers have a tick."""
-    n, P, kinds, sums = at.n, at.P, columns.kinds, columns.sums
+    n, P, (kinds, sums, _, factors) = at.n, at.P, columns
     for i in range(n):
         error = read_command(now, i, 0) - get(work, at.q + i)
         speed_error = read_command(now, i, 2) - get(work, at.v + i)
@@ -303,7 +304,8 @@ def _hold(work, at, columns, drives, now, is_tick):
             own = wide(0.0)
             for c in range(sums[p], sums[p + 1]):
                 if kinds[c, 1] == i:
-                    own += by_loop(kinds[c, 0], is_on, error, speed_error, late, torque)
+                    y = by_loop(kinds[c, 0], is_on, error, speed_error, late, torque)
+                    own += factors[c] * y
             own = where(is_tick, own - is_on * x, get(work, at.by_hold + i * P + p))
             put(work, at.by_hold + i * P + p, own)
 
@@ -367,7 +369,7 @@ def _bristle_column(work, at, terms, p, is_after):
 def _propagate(work, at, robot, columns, step, now):
     """Advance the sensitivities S of q and v, shape (2n, P), over a solved step."""
     n, P, drives, own = at.n, at.P, robot.drives, at.own
-    kinds, sums, directions = columns
+    kinds, sums, directions, factors = columns
     _combine(work, at, drives, step)
     for p in range(P):
         for i in range(n):
@@ -384,7 +386,7 @@ def _propagate(work, at, robot, columns, step, now):
                 x = (get(work, at.by_q + j) + kp) / get(work, at.loss + j)
                 put(work, own + j, get(work, own + j) - x)
             elif kind != START and kind != SPEED:
-                _drive_column(work, at, robot, step, now, kinds[c])
+                _drive_column(work, at, robot, step, now, kinds[c], factors[c])
         if at.held >= 0:
             for i in range(n):
                 x = get(work, at.by_hold + i * P + p) / get(work, at.loss + i)
@@ -395,8 +397,8 @@ def _propagate(work, at, robot, columns, step, now):
 
 
 @inner
-def _drive_column(work, at, robot, step, now, column):
-    """Add the derivative of a step's equation by a parameter of a drive."""
+def _drive_column(work, at, robot, step, now, column, share):
+    """Add a share of the derivative of a step's equation by a parameter of a drive."""
     drives, (codes, shapes, _, spans, bristles) = robot.drives, robot.terms
     kind, j, index = column
     span, speed, x = THETA * step, get(work, at.u + j), wide(0.0)
@@ -419,7 +421,7 @@ def _drive_column(work, at, robot, step, now, column):
         torque, is_on = loop_torque(drives[j], error, speed_error, read_command(now, j, 3))
         late = by_delay(drives[j], now, j)
         x = -by_loop(kind, is_on, error, speed_error, late, torque)
-    put(work, at.own + j, get(work, at.own + j) + x / get(work, at.loss + j))
+    put(work, at.own + j, get(work, at.own + j) + share * x / get(work, at.loss + j))
 
 
 @inner

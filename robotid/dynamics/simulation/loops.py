@@ -6,9 +6,9 @@ lanes of the compiled code simulate several windows in parallel.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import chain, islice, pairwise
+from itertools import chain, groupby, islice, pairwise
 from types import ModuleType
 from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeAlias
 
@@ -64,6 +64,11 @@ class Loops:
     def place(self, joint: int, term: DriveTerm) -> int:
         """Return the index of the parameter of a joint's term in ``values``."""
         return sum(map(len, self.terms[:joint])) + self.terms[joint].index(term)
+
+    def of(self, log: Log) -> "Loops":
+        """Return the loops with the gains of a log."""
+        kp, kd = log.gain_factors * np.stack([self.kp, self.kd])
+        return replace(self, kp=kp, kd=kd)
 
 
 def open_loops(model: RobotModel, pi: Array) -> Loops:
@@ -202,13 +207,15 @@ class ClosedLoopRobot:
         owners: Sequence[int] | None = None,
         with_speeds: bool = False,
     ) -> list[RollOut]:
-        """Return the simulated motion of windows; columns with one owner are added together."""
+        """Return the motion of windows, with their gains; columns of one owner are added."""
         kinds = np.array(columns, dtype=np.int64).reshape(-1, 3)
         numbers = np.arange(len(kinds)) if owners is None else np.array(owners, dtype=np.int64)
         wanted = np.column_stack([kinds, numbers])[np.argsort(numbers, kind="stable")]
         along = np.zeros((0, 10)) if directions is None else np.array(directions, order="C")
         size, outputs = _lanes().LANES, 2 if with_speeds else 1
-        blocks = [windows[k : k + size] for k in range(0, len(windows), size)]
+        groups = groupby(windows, key=lambda window: window.log.gain_factors.tobytes())
+        equal = [list(group) for _, group in groups]  # consecutive windows of equal gains
+        blocks = [some[k : k + size] for some in equal for k in range(0, len(some), size)]
         pieces = [(part, block) for block in blocks for part in self._parts]
         done = in_order(lambda p: self._block(p[0], p[1], loops, wanted, along, outputs), pieces)
         rolled: list[RollOut] = []
@@ -239,6 +246,9 @@ class ClosedLoopRobot:
         columns = wanted[np.isin(wanted[:, 1], own)]
         numbers, first = np.unique(columns[:, 3], return_index=True)
         sums = np.append(first, len(columns)).astype(np.int64)
+        log, factors = windows[0].log, np.ones((len(_KINDS), len(loops.kp)))
+        factors[[self.kinds["kp"], self.kinds["kd"]]] = log.gain_factors
+        loops, factors = loops.of(log), factors[columns[:, 0], columns[:, 1]]
         columns = np.ascontiguousarray(columns[:, :3])
         columns[:, 1] = [np.flatnonzero(own == j)[0] for j in columns[:, 1]]
         places, terms, affine = _arranged(loops, own)
@@ -254,7 +264,7 @@ class ClosedLoopRobot:
         q[0], v[0] = course.start
         is_held = loops.rate is not None
         at, work = lanes.places_of(n, len(numbers), len(terms.bristles), is_held)
-        kinds, motion = lanes.Columns(columns, sums, along), lanes.Motion(q, v, S)
+        kinds, motion = lanes.Columns(columns, sums, along, factors), lanes.Motion(q, v, S)
         failed = lanes.roll_out(robot, kinds, course, motion, work, at, self.corrects)
         if failed >= 0 or not (np.abs(v) < _FASTEST).all():
             rows = work.reshape(-1, lanes.LANES)
@@ -432,21 +442,20 @@ def _wrong_friction(model: RobotModel, loops: Loops, j: int, angle: float) -> st
         if is_negative or value > term.highest:
             wanted = "0 or more" if is_negative else f"at most {term.highest:g}"
             return f"{model.joints[j]}.{term.name} is {value:.3g}, expected {wanted}"
-    at_rest = float(friction_at_rest(loops, j, np.array([angle]))[0])
-    if at_rest >= 0.0:
-        return ""
-    unit, force = ("m", "N") if model.limits[j].type == "prismatic" else ("rad", "N m")
-    stated = f"{at_rest:.3g} {force} at {angle:.3g} {unit}"
-    return f"its Coulomb friction is {stated}, expected 0 or more"
+    return negative_friction(model, loops, j, np.array([angle]))
 
 
-def friction_at_rest(loops: Loops, j: int, q: Array) -> Array:
-    """Return the friction of a joint without load that opposes the start of a motion: q (N,)."""
+def negative_friction(model: RobotModel, loops: Loops, j: int, q: Array) -> str:
+    """Return where friction would start the motion of an unloaded joint, else "": q (N,)."""
     friction = np.zeros(len(q))
     for term in loops.terms[j]:
         if isinstance(term, MemorylessTerm) and term.kind == DIRECTED:
             friction += loops.values[loops.place(j, term)] * term.amplitude(q, np.zeros(len(q)))
-    return friction
+    if not (least := float(friction.min())) < 0.0:
+        return ""
+    unit, force = ("m", "N") if model.limits[j].type == "prismatic" else ("rad", "N m")
+    stated = f"{least:.3g} {force} at {q[np.argmin(friction)]:.3g} {unit}"
+    return f"its Coulomb friction is {stated}, expected 0 or more"
 
 
 def _slow_rate(loops: Loops, rate: float, names: list[str], joints: Array, M: Array) -> str:

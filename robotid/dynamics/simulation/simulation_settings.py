@@ -1,6 +1,5 @@
 """Settings of a simulation: true parameters, controller, actuators, sensors and payload."""
 
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robotid.base.exceptions import SettingsError
-from robotid.base.files import missing_file
+from robotid.base.files import read_toml
 from robotid.base.findings import listed, suggestion
 from robotid.base.settings import (
     NOT_NEGATIVE,
@@ -271,14 +270,7 @@ def read_simulation(
     path: str | Path | None, given: Mapping[str, Any]
 ) -> tuple[Simulation, dict[str, Any]]:
     """Return the settings in a TOML file, and its table of further drive terms by joint."""
-    table: dict[str, Any] = {}
-    if path is not None:
-        if not Path(path).is_file():
-            raise SettingsError(missing_file(Path(path), "file of a plant"))
-        try:
-            table = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-        except (ValueError, RecursionError) as error:
-            raise SettingsError(f"{Path(path).name} is not valid TOML: {error}") from error
+    table = {} if path is None else read_toml(Path(path), "file of a plant")
     where = "command line" if path is None else Path(path).name
     schema = Simulation.schema() | {"drives": (dict,)}
     check_keys(table, schema, where)

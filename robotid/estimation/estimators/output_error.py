@@ -196,11 +196,8 @@ class OutputError(Estimator[Simulator]):
         return moved
 
     def settle(self, simulator: Simulator, estimate: Estimate) -> Estimate:
-        """Return the estimate after a step of it together with the windows' initial states.
-
-        With initial states fixed by earlier parameters the fit is biased, and standard errors
-        assume that they are free.
-        """
+        """Return the estimate after a step of it together with the windows' initial states."""
+        # with initial states fixed at those of earlier parameters the fit is biased
         residuals = simulator.residuals(estimate.theta, with_slopes=True, with_starts=True)
         weights, theta = self._weigh(residuals, frees=True), estimate.theta
         how = {key: getattr(estimate, key) for key in ("converged", "n_iter", "message")}
@@ -209,10 +206,7 @@ class OutputError(Estimator[Simulator]):
         return settled
 
     def moved(self, simulator: Simulator, other: Simulator, theta: Array) -> tuple[Array, Array]:
-        """Return the first-order change of an estimate for other residuals, with its errors, (c,).
-
-        Standard errors are those for independent whitened residuals of ``other``.
-        """
+        """Return the first-order change of an estimate for other residuals and its errors, (c,)."""
         weights = self.weights(other, theta)
         (H, g), (_, changed) = (
             self.normal(s, weights, theta, frees=True) for s in (simulator, other)
@@ -417,10 +411,8 @@ def _bounded_step(H: Array, g: Array, theta: Array, bounds: Array, damping: floa
 def _segments(
     parts: Sequence[tuple[Array, Array, Array]], c: int, *, are_windows: bool
 ) -> list[Factors]:
-    """Return the factors of the whitened rows of c parameters, segment by segment.
-
-    With ``are_windows`` a window is about one: without feedback an early error persists to its end.
-    """
+    """Return the factors of the whitened rows of c parameters, segment by segment."""
+    # about one for each window if ``are_windows``: without feedback an error persists to its end
     total, names = sum(len(b) for _, b, _ in parts), tuple(map(str, range(c)))
     segments: list[Factors] = []
     for A, b, columns in parts:

@@ -1,6 +1,6 @@
 """identify_loops(): closed-loop identification from command logs, its result and its findings."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -33,6 +33,7 @@ from robotid.diagnosis.verdict.verdict import (
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.friction_projection import DriveMoments, drive_moments
 from robotid.dynamics.simulation.loops import LOOP_GAP, Loops, open_loops
+from robotid.dynamics.simulation.simulation_settings import by_joint
 from robotid.dynamics.torque import predict_instants
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import segment_scores
@@ -78,6 +79,8 @@ _MOVING = 0.05  # smallest speed above the noise, relative to the largest speed 
 _MISMATCH = 0.5  # largest relative error of a torque that the loop of its joint gives
 _KNOWN = 0.1  # standard error of a known delay, relative to the range found from one response
 _POSITIVE = ("kp", "limit")  # parameters whose lower bound is more than 0
+#: Figures of a log's gains relative to the fit; that of kd is 0 where the fit has none.
+_GAINS = {"kp": "ratio", "kd": "kd_ratio"}
 _UNEQUAL = 3.0  # ratio of the gains of equal drives from which on they are reported
 
 
@@ -220,13 +223,6 @@ def identify_loops(
         logs, validation = (
             [driven_log(model, log, used) for log in part] for part in (logs, validation)
         )
-    for log in (*logs, *validation):
-        if log.q_ref is None:
-            raise DataError(
-                f"{log.name} has no commands, which the estimator 'simulation' needs. Record "
-                "columns qref_ of each joint, or simulate from the logged torque: [controller] "
-                "kind = 'torque'"
-            )
     if loop.gravity_compensation:
         logs, validation = (
             [with_gravity(model, log) for log in part] for part in (logs, validation)
@@ -282,15 +278,8 @@ def with_gravity(model: RobotModel, log: Log) -> Log:
 
 
 def driven_log(model: RobotModel, log: Log, signals: SignalSettings) -> Log:
-    """Return a log whose feed-forward torque is the measured one, and its position the command.
-
-    It is constant between two rows: the mean of the two, which avoids a delay of half a row.
-    """
-    if not log.has_torque:
-        raise DataError(
-            f"{log.name} has no torque, which [controller] kind = 'torque' needs as the input. "
-            "Record columns tau_ of each joint, or set kind = 'pd' for a log of commands"
-        )
+    """Return a log whose feed-forward torque is the measured one, and its position the command."""
+    # constant between two rows: the mean of the two, which avoids a delay of half a row
     free = np.array([joint.turns_freely for joint in model.limits])
     log = unwrap(log, free)
     measured = np.column_stack(
@@ -453,11 +442,8 @@ def _settled_delay(examined: Finding, result: PositionIdentification) -> Finding
     error = max(errors, default=0.0)
     if error > _KNOWN * span:
         return examined
-    entry = entries()["slow_command:known"]
-    fault = entry["message"].replace("{what}", entry["what"]["fitted" if errors else "stated"])
-    evidence = {**examined.evidence, "std_error": error}
-    settled = {"severity": "note", "fault": fault, "remedy": entry["remedy"]}
-    return examined.reworded(**settled, evidence=evidence)
+    what, figures = "fitted" if errors else "stated", {**examined.evidence, "std_error": error}
+    return finding("slow_command:known", examined.log, examined.joints, what=what, **figures)
 
 
 def _at_bound(result: PositionIdentification, *, is_explained: bool) -> Iterator[Finding]:
@@ -517,13 +503,30 @@ def _other_gains(result: PositionIdentification) -> Iterator[Finding]:
         runs = (*rest, *runs)
     for run in runs:
         joints = np.flatnonzero(_relative_errors(run) > np.maximum(least, GOOD_POSITION))
+        found: dict[int, dict[str, float]] = {}
         for j, figures in fit_gains(fit.simulator, loops, run.log, joints).items():
             # the motion with a missing friction term may have a gain that differs by some 30 %
             ratio = max(figures["ratio"], LEAST_DIVISOR)
             change, error = abs(np.log(ratio)), figures["std_error"] / ratio
             if figures["after"] < BETTER * figures["before"] and change > BETTER + 2 * error:
-                joint = result.model.joints[j]
-                yield finding("other_gains", run.log.name, joint, others=others, **figures)
+                found[j] = figures
+        gains = _stated_gains(result, run.log, found)
+        for j, figures in found.items():
+            joint = result.model.joints[j]
+            yield finding("other_gains", run.log.name, joint, others=others, gains=gains, **figures)
+
+
+def _stated_gains(
+    result: PositionIdentification, log: Log, found: Mapping[int, Mapping[str, float]]
+) -> str:
+    """Return the entry of a job file that states the gains found for joints in a log."""
+    joints, entries = result.model.joints, list[str]()
+    for factors, (name, key) in zip(log.gain_factors, _GAINS.items(), strict=True):
+        own = factors * by_joint(getattr(result.loop, name), joints, f"controller: {name}", 1.0)
+        entries += [
+            f"{name}.{joints[j]} = {x[key] * own[j]:.3g}" for j, x in found.items() if x[key]
+        ]
+    return f"controller = {{ {', '.join(entries)} }}"
 
 
 def _valid_bands(result: PositionIdentification) -> Iterator[Finding]:

@@ -78,11 +78,8 @@ class SecondOrder:
 
     @property
     def inertia(self) -> Array:
-        """Inertia J of each joint [kg m^2 or kg].
-
-        Of a joint that does not determine it, the standard error is its size, within those of the
-        loops that are tried: a smaller estimate would make a common scale of torques arbitrary.
-        """
+        """Inertia J of each joint [kg m^2 or kg]; if not determined, its standard error."""
+        # within the inertias that are tried: with less, a common scale of torques is arbitrary
         found, kp = self.loops.armature, self.loops.kp
         fastest, slowest = (kp / w**2 for w in (_FREQUENCIES[-1], _FREQUENCIES[0]))
         possible = np.maximum(found, np.clip(self.inertia_error, fastest, slowest))
@@ -125,7 +122,7 @@ def fit_second_order(
 ) -> SecondOrder:
     """Fit the second-order model to windows: a coarse grid for every joint, then least squares."""
     n = len(stated.kp)
-    error = np.concatenate([w.log.q_ref[w.counted] - w.log.q[w.counted] for w in windows])  # type: ignore[index]
+    error = np.concatenate([_loop_error(w.log)[w.counted] for w in windows])
     torque = stated.kp * np.maximum(np.sqrt(np.mean(error**2, axis=0)), 1e-6)
     # a drive bears the load by gravity within its limit
     mean = stated.kp * error.mean(axis=0) * finds_limit
@@ -223,20 +220,13 @@ def typical_sizes(
     groups: Sequence[str],
     factor: Array | float = 1.0,
 ) -> TypicalSizes:
-    """Return typical sizes; where a gain is unknown, the inertia of bodies scales all torques.
-
-    Joints of a group have one gain, and so one scale: the median of those whose motion determines
-    their inertia. With scales of their own, the friction of one relative to their common gain would
-    not be that of its motion: more than the drive can overcome, and its simulation never moves.
-
-    At its largest speed, ``top`` if more than 0, the limit of a drive is the friction torque.
-    """
-    # has_gain (n,), top (n,) [rad/s or m/s], factor (n,) [-]
+    """Return typical sizes; where a gain is unknown, the inertia of bodies scales all torques."""
+    # has_gain (n,), largest speeds top (n,), else 0 [rad/s or m/s], factor (n,) [-]
     model = robot.model
-    q = np.concatenate([w.log.q[w.counted] for w in windows])
     bodies = _inertia(model, model.standard_parameters(), windows)
     measure = np.maximum(bodies, _SMALLEST_BODY * bodies.max()) / _SHARE
     scale = np.where(has_gain, 1.0, measure / plain.inertia)
+    # joints of one gain have one scale: with others, friction may exceed the torque of a drive
     for group in dict.fromkeys(groups):
         own = (np.array(groups) == group) & ~has_gain
         shown = own & plain.shows_inertia
@@ -245,12 +235,17 @@ def typical_sizes(
     scale = np.where(has_gain, 1.0, factor * scale)
     # friction may hide the inertia in a second-order model
     inertia = np.maximum(plain.inertia * scale, bodies)
-    error = np.concatenate([w.log.q_ref[w.counted] for w in windows]) - q  # type: ignore[index]
+    error = np.concatenate([_loop_error(w.log)[w.counted] for w in windows])
     unlimited = _LIMITED * plain.loops.kp * np.abs(error).max(axis=0)
     unlimited = np.minimum(unlimited, plain.loops.limit)
     friction = plain.friction("viscous") * top + plain.friction("coulomb")
     largest = scale * np.where(top > 0.0, np.minimum(friction, unlimited), unlimited)
     return TypicalSizes(inertia, bodies, plain.torque * scale, largest, _speed(windows), scale)
+
+
+def _loop_error(log: Log) -> Array:
+    """Return the position error of a log times its factors of kp, (N, n) [rad or m]."""
+    return np.asarray(log.gain_factors[0] * (log.q_ref - log.q))
 
 
 def typical_sizes_of_torques(
@@ -367,11 +362,9 @@ def is_stated(value: PerJoint | str | None, model: RobotModel) -> Array:
 class Encoders:
     """Encoder zeros and signs relative to the URDF, q_urdf = sign q + zero; arrays of shape (n,).
 
-    The load causes a position error of a servo's loop, q_ref - q = tau / kp + friction, so that a
-    regression on the URDF's torques determines zero and sign of each encoder. It uses the slow
-    motion: in fast motion lags are larger than the effect of gravity, and friction, which acts in
-    both directions, averages to zero. The common sign of joints with parallel axes is not
-    identifiable: the position errors by gravity are the same with all signs reversed.
+    Gravity causes a position error, q_ref - q = tau / kp + friction, whose regression on the URDF's
+    torques determines both. In fast motion, lags are larger than this effect. The common sign of
+    joints with parallel axes is not identifiable: gravity causes the same errors with all reversed.
     """
 
     sign: Array  # 1, or -1 of an encoder with the opposite sign
@@ -476,7 +469,7 @@ def _smooth(log: Log, count: int, cutoff: float) -> tuple[Array, ...]:
 
     v = np.gradient(low_pass(log.q, _FAST), dt, axis=0)
     direction = np.tanh(v / SignalSettings().min_velocity)  # friction reverses about this speed
-    motion = (log.q, v, np.gradient(v, dt, axis=0), log.q_ref - log.q, direction)
+    motion = (log.q, v, np.gradient(v, dt, axis=0), _loop_error(log), direction)
     rows = np.linspace(0, len(log.t) - 1, count).astype(int)
     return tuple(low_pass(x, cutoff)[rows] for x in motion)
 
@@ -488,7 +481,7 @@ class _Motion:
     q: Array
     v: Array
     a: Array
-    error: Array  # q_ref - q
+    error: Array  # q_ref - q, times the log's factor of kp
     direction: Array  # of friction
 
     def cost(self, model: RobotModel, sign: Array, zero: Array) -> float:

@@ -4,10 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
+
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed, suggestion
 from robotid.base.settings import Entries, Range, Settings, setting
-from robotid.dynamics.simulation.simulation_settings import DELAY, GAIN, LEVEL, PerJoint
+from robotid.base.typing import Array
+from robotid.dynamics.simulation.simulation_settings import DELAY, GAIN, LEVEL, PerJoint, by_joint
 
 _CLOCK = Range("1 to 2e4 Hz", lambda x: 1.0 <= x <= 2e4)
 #: Settings that do not apply where the logged torque drives the robot.
@@ -29,24 +32,22 @@ class LoopSettings(Settings):
         among=("pd", "torque"),
     )  # fmt: skip
     kp: PerJoint | None = setting(
-        None, "position gain [N m/rad or N/m], for all joints or by joint; default: fitted, "
-        "relative to gravity and inertia of the bodies", **GAIN,
+        None, "position gain [N m/rad or N/m]; default: fitted, relative to gravity and inertia of "
+        "the bodies", **GAIN,
     )  # fmt: skip
     kd: PerJoint | None = setting(
-        None, "speed gain [N m s/rad or N s/m], for all joints or by joint; default: part of the "
-        "viscous friction, or fitted if the logs have speed commands or torques", **LEVEL,
+        None, "speed gain [N m s/rad or N s/m]; default: part of the viscous friction, or fitted "
+        "if the logs have speed commands, torques, or own gains of a known ratio", **LEVEL,
     )  # fmt: skip
     limit: PerJoint | str | None = setting(
         None,
-        "torque limit of the drive [N m or N], for all joints or by joint; default: fitted "
-        "where the drive saturates; 'find': fitted for every joint",
+        "torque limit of the drive [N m or N]; default: fitted where the drive saturates; 'find': "
+        "fitted for every joint",
         reads=(int, float, dict, str),
         within=GAIN["within"],
         among=("find",),
     )
-    delay: PerJoint | None = setting(
-        None, "delay of the command [s], for all joints or by joint; default: fitted", **DELAY
-    )
+    delay: PerJoint | None = setting(None, "delay of the command [s]; default: fitted", **DELAY)
     delays: str = setting(
         "one", "the fitted delays: 'one' for the robot (bus and controller), or one per 'group'",
         among=("one", "group"),
@@ -82,6 +83,34 @@ class LoopSettings(Settings):
                     f"drives the robot, without a controller. Leave {name} out, or set kind = "
                     f"'pd'.{how if name == 'delay' else ''}"
                 )
+
+
+@dataclass(frozen=True)
+class LogGains(Settings):
+    """Gains of one log that differ from those in [controller]."""
+
+    _table: ClassVar[str] = "controller of a log"
+
+    kp: PerJoint | None = setting(
+        None, "position gain [N m/rad or N/m], relative to the fitted one [-] if [controller] has "
+        "none; default: the gain in [controller]", **GAIN,
+    )  # fmt: skip
+    kd: PerJoint | None = setting(None, "speed gain, likewise", **GAIN)
+
+    def factors(self, common: LoopSettings, joints: Sequence[str]) -> Array:
+        """Return the gains over those of the controller, shape (2, n) [-]."""
+        factors = np.ones((2, len(joints)))
+        for row, name in zip(factors, ("kp", "kd"), strict=True):
+            usual = by_joint(getattr(common, name), joints, f"controller: {name}", 1.0)
+            own = by_joint(getattr(self, name), joints, f"{self._table}: {name}", usual)
+            if common.kind == "torque" or (usual[own != usual] == 0.0).any():
+                has = "kind 'torque'" if common.kind == "torque" else f"{name} = 0"
+                raise SettingsError(
+                    f"{self._table}: {name} is {getattr(self, name)!r}, but [controller] has "
+                    f"{has}, which no gain of a log changes. Correct one of the two"
+                )
+            row[own != usual] = (own / usual)[own != usual]
+        return factors
 
 
 def groups_of(settings: LoopSettings, joints: Sequence[str], alike: Sequence[Any]) -> list[str]:

@@ -25,7 +25,7 @@ from robotid.dynamics.simulation.loops import (
     Loops,
     RollOut,
     Window,
-    friction_at_rest,
+    negative_friction,
 )
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import (
@@ -64,9 +64,9 @@ class DriveTorques:
     """Torques of drives at the counted samples of a roll-out; arrays of shape (N, n)."""
 
     unlimited: Array  # kp position_error + kd speed_error + tau_ref [N m or N]
-    position_error: Array  # q_ref - q [rad or m]
-    speed_error: Array  # v_ref - v [rad/s or m/s]
-    loops: Loops  # the loops, with the torque limits
+    position_error: Array  # q_ref - q, times the log's factor of kp [rad or m]
+    speed_error: Array  # v_ref - v, times the log's factor of kd [rad/s or m/s]
+    loops: Loops  # the loops with the gains of the log, and the torque limits
 
     @property
     def limited(self) -> Array:
@@ -110,9 +110,9 @@ def drive_torques(out: RollOut, loops: Loops, lag: Array) -> DriveTorques:
         )
         for x in (log.q_ref, log.v_ref, log.tau_ref)
     )
-    error, speed_error = q_ref - out.q, v_ref - out.v
+    error, speed_error = log.gain_factors[:, None] * np.stack([q_ref - out.q, v_ref - out.v])
     unlimited = loops.kp * error + loops.kd * speed_error + tau_ref
-    return DriveTorques(unlimited, error, speed_error, loops)
+    return DriveTorques(unlimited, error, speed_error, loops.of(log))
 
 
 def measured_motion(window: Window) -> RollOut:
@@ -127,12 +127,9 @@ def measured_motion(window: Window) -> RollOut:
 def find_gains(
     outs: Sequence[RollOut], loops: Loops, is_free: Array, *, knows_delay: bool, is_whole: bool
 ) -> tuple[Array, Loops]:
-    """Return the lag of measured torques, (n,) [samples], and the loops with gains fitted to them.
-
-    A command that is constant over a row jumps between rows, and with it the torque of a stiff
-    loop. The lag of least squared error is taken; a fractional one, as of torques averaged over a
-    row, only where the improvement is significant. Gains whose estimate is negative do not change.
-    """
+    """Return the lag of measured torques, (n,) [samples], and the loops with fitted gains."""
+    # A fractional lag, as of torques averaged over a row, needs a significant improvement: commands
+    # are constant over a row, and the torque of a stiff loop jumps between rows.
     dt = float(np.median(np.diff(outs[0].window.log.t)))
     delayed = np.ceil(loops.delay / dt - 1e-6)
     # a known delay is that of a row at most one row away
@@ -209,11 +206,8 @@ def free_body_parameters(robot: ClosedLoopRobot, spread: float) -> list[FreePara
     """Return free parameters of bodies relative to the URDF, four each, with prior 0.
 
     J' = U T T' U' with U U' the URDF's pseudo-inertia, and T the unit matrix except its last
-    column, (c, exp m). Mass, centre of mass and the moments about the joint change; the
-    distribution about the centre does not. Every value is a physically consistent body.
-
-    References:
-        Rucker, Wensing (2022), Smooth parameterization of rigid-body inertia, (12)-(14).
+    column, (c, exp m). Every value is a physically consistent body with the same distribution about
+    its centre (Rucker, Wensing 2022, Smooth parameterization of rigid-body inertia, (12)-(14)).
     """
     layout = robot.model.layout
     J = pseudo_inertia(robot.model.standard_parameters()[: layout.n_inertial])
@@ -287,10 +281,6 @@ class LoopSimulator:
                 name, places = "values", [base.place(j, free.term) for j in free.joints]
             changed.setdefault(name, getattr(base, name).copy())[places] = value
         return replace(base, bodies=self._bodies(theta)[0], **changed)
-
-    def roll_out(self, theta: Array, windows: Sequence[Window] | None = None) -> list[RollOut]:
-        """Return the roll-outs of windows: theta (c,)."""
-        return self.robot.roll_out(self.loops(theta), self.windows if windows is None else windows)
 
     def with_better_start(self, theta: Array) -> "LoopSimulator":
         """Return the simulator with fitted initial states: with friction, their errors last."""
@@ -596,11 +586,8 @@ def impossible(simulator: LoopSimulator, theta: Array, tried: Sequence[Tried]) -
     for t in weakest.values():
         j = model.joints.index(t.joint)
         q = np.concatenate([w.log.q[w.counted, j] for w in simulator.windows])
-        friction = friction_at_rest(loops, j, q)
-        if (least := float(friction.min())) < 0.0:
-            at = float(q[np.argmin(friction)])
-            unit, force = ("m", "N") if t.joint in model.layout.prismatic else ("rad", "N m")
-            why[t] = f"the friction at {at:.3g} {unit} is {least:.2g} {force}, expected 0 or more"
+        if negative := negative_friction(model, loops, j, q):
+            why[t] = negative
     return why
 
 
@@ -666,11 +653,8 @@ class GainScale:
 
 
 def gain_scale(simulator: LoopSimulator, estimator: OutputError, estimate: Estimate) -> GainScale:
-    """Return the scale of the stated gains that bodies, and fitted torques, indicate.
-
-    Drive parameters scale with the gains; weight and inertia of bodies do not. To first order: one
-    Gauss-Newton step of gains and all free parameters.
-    """
+    """Return the scale of the stated gains that bodies, and fitted torques, indicate."""
+    # one Gauss-Newton step: drive parameters scale with the gains, weight and inertia do not
     n, c, gains = len(simulator.base.kp), len(estimate.theta), []
     for what in ("kp", "kd"):
         if any(free.what == what for free in simulator.free_parameters):

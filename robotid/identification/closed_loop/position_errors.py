@@ -26,15 +26,12 @@ _DRIVEN = (*_COMMANDED, "rows", "steady")  # ... and of those driven by the logg
 
 @dataclass(frozen=True, eq=False)
 class PositionEvaluation:
-    """A log and its simulation from the commands alone; errors are RMS values of shape (n,).
-
-    A simulation driven by the logged torque restarts from the log every ``DRIFTS``.
-    """
+    """A log and its simulation from the commands alone; errors are RMS values of shape (n,)."""
 
     log: Log
     units: tuple[str, ...]  # of the positions, by joint
-    #: Simulated positions of the identified robot, started once, shape (N, n) [rad or m];
-    #: NaN at a single sample between gaps.
+    #: Simulated positions of the identified robot, (N, n) [rad or m], started once, or every
+    #: ``DRIFTS`` if the logged torque drives it; NaN at a single sample between gaps.
     q: Array
     rmse: Array  # error of the simulated positions
     #: Errors of simpler models, by name; None if unknown or unstable. "command": the command
@@ -76,10 +73,8 @@ class PositionEvaluation:
         return np.asarray(np.ptp(self.log.q_ref, axis=0) > 0)
 
     def valid_band(self, j: int) -> dict[str, float] | None:
-        """Return the frequency above which all errors of a joint are large, and its errors.
-
-        Errors below and above it are relative to the motion, at frequencies of the command [-].
-        """
+        """Return the frequency above which all errors of a joint are large, and its errors."""
+        # below and above it, relative to the motion, at frequencies of the command [-]
         from scipy.ndimage import median_filter
         from scipy.signal import welch
 

@@ -6,6 +6,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from itertools import compress, product
+from typing import Any
 
 import numpy as np
 
@@ -138,9 +139,9 @@ def fit_loops(
             simulator = replace(simulator, windows=every).with_better_start(theta)
         simulator = simulator.with_better_start(theta)
         if simulator.lag is not None:
-            outs = simulator.roll_out(theta, _few(simulator.windows))
-            gains, is_last = (simulator.loops(theta), _free_gains(loop, model)), left == 0
-            lag, _ = find_gains(outs, *gains, knows_delay=True, is_whole=not is_last)
+            loops, is_free = simulator.loops(theta), _free_gains(loop, model)
+            outs = simulator.robot.roll_out(loops, _few(simulator.windows))
+            lag, _ = find_gains(outs, loops, is_free, knows_delay=True, is_whole=left > 0)
             simulator = replace(simulator, lag=lag)
         # one round is enough while the initial states or the terms still change
         is_rough = is_plain and (left > 0 or chooses)
@@ -171,9 +172,8 @@ def fit_loops(
             break
         for t, why in failing.items():
             dropped[f"{t.joint}.{t.terms[0]}"] = replace(t, is_chosen=False, dropped=why)
-    scale = None
-    if initialised.linear is None and is_stated(loop.kp, model).all():
-        scale = gain_scale(simulator, estimator, estimate)
+    is_scaled = initialised.linear is None and is_stated(loop.kp, model).all()
+    scale = gain_scale(simulator, estimator, estimate) if is_scaled else None
     others = (initialised.encoders, tuple(tried), initialised.linear, scale)
     return Fitted(simulator, estimate, initialised.plain, *others)
 
@@ -181,21 +181,18 @@ def fit_loops(
 def fit_one_log(fitted: Fitted, log: Log) -> Loops:
     """Return the loops with drives and gains, but no bodies, fitted to one log."""
     free = [x.what != "body" for x in fitted.simulator.free_parameters]
-    of_drives = tuple(compress(fitted.simulator.free_parameters, free))
+    drives = tuple(compress(fitted.simulator.free_parameters, free))
     windows = _few(cut_windows(log, _WINDOW, _LEAD))
-    alone = replace(fitted.simulator, windows=windows, base=fitted.loops)
-    alone = replace(alone, free_parameters=of_drives)
+    alone = replace(fitted.simulator, windows=windows, base=fitted.loops, free_parameters=drives)
     return alone.loops(OutputError(rounds=1).minimise(alone, fitted.estimate.theta[free]))
 
 
 def fit_gains(
     simulator: LoopSimulator, loops: Loops, log: Log, joints: Array
 ) -> dict[int, dict[str, float]]:
-    """Return the gains of joints (k,) fitted to one log, all else unchanged; {} if it fails.
-
-    The figures of a joint are the ratio of kp to that of the loops with its standard error, and the
-    errors of simulated positions before and after [% of RMS motion].
-    """
+    """Return the gains of joints (k,) fitted to one log, all else unchanged; {} if it fails."""
+    # relative to those of the loops: the ratio of kp with its standard error, and of kd, 0 without
+    # one; and the errors of simulated positions before and after [% of RMS motion]
     windows, own = _few(cut_windows(log, _WINDOW, _LEAD)), np.stack([loops.kp, loops.kd])[:, joints]
     pairs = [(what, int(j)) for what in ("kp", "kd") for j in joints]
     free = tuple(FreeParameter(f"{w} {j}", w, (j,), 0.0, np.inf, 0.0) for w, j in pairs)
@@ -209,9 +206,9 @@ def fit_gains(
         return {}
     estimate = OutputError(whitens=False).fit(alone, min(errors, key=lambda x: float(x[0]))[1])
     before, after = (_errors_of(alone, x)[joints] for x in (loops, alone.loops(estimate.theta)))
-    k, names = len(joints), ("ratio", "std_error", "before", "after")
-    figures = [estimate.theta[:k] / own[0], estimate.std_error[:k] / own[0], before, after]
-    rows = np.array(figures).T.tolist()
+    k, names = len(joints), ("ratio", "kd_ratio", "std_error", "before", "after")
+    ratios = np.divide(estimate.theta.reshape(2, k), own, where=own > 0.0, out=np.zeros_like(own))
+    rows = np.array([*ratios, estimate.std_error[:k] / own[0], before, after]).T.tolist()
     return {j: dict(zip(names, row, strict=True)) for (_, j), row in zip(pairs, rows, strict=False)}
 
 
@@ -278,14 +275,10 @@ def _with_chosen_terms(
 
 
 def _best_start(initial: "_Initial") -> tuple["_Initial", Array]:
-    """Return the initial values with the best first fit, and its parameters, shape (c,).
-
-    Others are tried where the error of a joint is larger than that of a good fit and hardly smaller
-    than that of its second-order model: other scales of the torques. Torque limits are tried for
-    every error that is larger, and taken if the error is then clearly smaller: they also fit what
-    is no limit. Each group of joints with one gain takes its best. A fit that cannot be simulated
-    is no candidate.
-    """
+    """Return the initial values with the best first fit, and its parameters, shape (c,)."""
+    # Other scales of torques are tried if an error is large and hardly smaller than that of the
+    # second-order model; limits if it is large, and taken if it is then clearly smaller: they also
+    # fit what is no limit. Each group of joints with one gain takes its best.
     if initial.vary is None or initial.plain is None:
         return _first_fit(initial)[:2]
     n, groups, fits = len(initial.torque), np.array(initial.groups), []
@@ -405,8 +398,9 @@ def _initialise_from_commands(task: _Task) -> _Initial:
     top = np.array([max(x.get(joint, 0.0) for x in saturated) for joint in model.joints])
     may_limit = ~is_stated(None if loop.limit == "find" else loop.limit, model)
     top, may_limit = np.where(may_limit, top, 0.0), may_limit & (loop.limit != "find")
-    # positions alone determine only the sum of kd and viscous friction, except at a torque limit
-    finds_kd = uses_torques or all(log.v_ref is not None for log in logs)
+    # positions alone determine kd + viscous friction, except at a limit or if kd differs by log
+    differs = np.ptp([log.gain_factors[1] for log in logs], axis=0) > 0.0
+    finds_kd = differs | uses_torques | all(log.v_ref is not None for log in logs)
     dt = max(float(np.median(np.diff(log.t))) for log in logs)
     most = np.tile(np.exp(-_WHITE * dt / plain.time_constant), 3)  # positions, speeds, torques
     estimator = OutputError(most=most, progress=task.progress)
@@ -471,12 +465,9 @@ def _initialise_from_torque(task: _Task) -> _Initial:
 def refine_steps(
     simulator: LoopSimulator, estimator: OutputError, estimate: Estimate
 ) -> tuple[LoopSimulator, Estimate]:
-    """Fit roll-outs of smaller steps, where halving the step changes the estimate.
-
-    Steps are halved until this changes no parameter by more than 0.2 standard errors. Derivatives
-    stay those of the larger steps: they do not change the minimum. The change by the last halving
-    is added to the covariance, since all further halvings together would change as much again.
-    """
+    """Fit roll-outs of smaller steps, halved until a parameter changes by 0.2 standard errors."""
+    # Derivatives stay those of the larger steps: they do not change the minimum. All further
+    # halvings together would change as much as the last one, which is added to the covariance.
     dt = float(np.median(np.diff(simulator.windows[0].log.t)))
     step, now = dt / np.ceil(dt / simulator.robot.step - 1e-9), simulator
     for halvings in range(_HALVINGS + 1):
@@ -496,14 +487,9 @@ def refine_steps(
 def _settled(
     simulator: LoopSimulator, estimator: OutputError, estimate: Estimate
 ) -> tuple[LoopSimulator, Estimate]:
-    """Return the estimate with the best initial states of the windows, and these windows.
-
-    Fits of the initial states and joint steps of states and parameters alternate, until a step
-    changes no parameter by more than 0.2 standard errors. Joints that stick may make the steps
-    alternate without end: the change by the last one is then added to the covariance. If such a
-    step raises the residual or cannot be simulated, as may happen far from the minimum, the
-    parameters are fitted from the best initial states.
-    """
+    """Return the estimate with the best initial states of the windows, and these windows."""
+    # Fits of the initial states and joint steps alternate; joints that stick may do so without end,
+    # and the last change is added to the covariance. Far from the minimum a step may fail.
     level, first = np.inf, estimate.theta
     for _ in range(_HALVINGS):
         try:
@@ -543,22 +529,14 @@ def _check_logs(logs: Sequence[Log], loop: LoopSettings, settings: SimulationSet
 
 def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:
     """Return the loops as stated, with the URDF's bodies; kp is 1 where it is not given."""
-    n = len(model.joints)
-    default = {"kp": 1.0, "kd": 0.0, "limit": np.inf, "delay": 0.0}
-    stated = {name: getattr(loop, name) for name in default}
-    stated["limit"] = None if loop.limit == "find" else loop.limit
-    return Loops(
-        bodies=model.standard_parameters()[: model.layout.n_inertial].reshape(-1, 10),
-        armature=np.zeros(n),
-        **{
-            name: by_joint(value, model.joints, f"controller: {name}", default[name])
-            for name, value in stated.items()
-        },
-        zero=np.zeros(n),
-        terms=((),) * n,
-        values=np.zeros(0),
-        rate=loop.rate,
-    )
+    n, stated = len(model.joints), dict[str, Any]()
+    for name, default in (("kp", 1.0), ("kd", 0.0), ("limit", np.inf), ("delay", 0.0)):
+        value = getattr(loop, name)
+        given = None if value == "find" else value
+        stated[name] = by_joint(given, model.joints, f"controller: {name}", default)
+    bodies = open_loops(model, model.standard_parameters())
+    bare = replace(bodies, armature=np.zeros(n), terms=((),) * n, values=np.zeros(0))
+    return replace(bare, rate=loop.rate, **stated)
 
 
 def _few(windows: Sequence[Window], count: int = _FEW) -> tuple[Window, ...]:

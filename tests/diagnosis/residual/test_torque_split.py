@@ -17,6 +17,7 @@ from robotid.diagnosis.decisions import FEWEST, p_value
 from robotid.diagnosis.residual.joint_torques import (
     JointTorque,
     Rows,
+    _beyond_torque,
     _broadband_shares,
     even_bins,
     follow,
@@ -292,6 +293,36 @@ def test_what_is_forgotten_is_one_less_the_autocorrelation_of_all_recordings(rng
     *found, still = _broadband_shares(evaluations)
     np.testing.assert_allclose(found, 1.0 - shares[0, :2] / shares[1, :2])
     assert still is None
+
+
+def test_a_cutoff_is_advised_above_which_the_torque_lacks_what_is_predicted(rng):
+    """A torque that is filtered beside one of noise, in the longest segment of two recordings."""
+    t = np.arange(3000) / 100.0
+    slow, quick = np.sin(2 * np.pi * 0.6 * t), np.sin(2 * np.pi * 5.0 * t)
+    noise = 0.3 * rng.standard_normal(len(t))
+    tau = np.column_stack([3 * slow, slow + noise, 0 * t])
+    r = np.column_stack([0.2 * slow - 0.3 * quick, noise, 0 * t])
+    segment = np.repeat([0, 1], [600, 2400])
+    r[:600] = tau[:600]  # the shorter segment is not examined
+    evaluations = [
+        SimpleNamespace(
+            recording=SimpleNamespace(
+                trajectory=SimpleNamespace(
+                    t=t[:rows], tau=tau[:rows], segment=segment[:rows], rate=100.0
+                ),
+                signals=SignalSettings(cutoff=8.0),
+            ),
+            torques={"estimate": (tau - r)[:rows]},
+        )
+        for rows in (900, 3000)
+    ]  # fmt: skip
+    frequency, share = _beyond_torque(evaluations)
+    assert 0.6 < frequency < 5.0
+    np.testing.assert_allclose(share, [0.3**2 / (0.2**2 + 0.3**2), 0.0, 0.0], atol=0.01)
+    filtered = replace(torque(r[:, 0], slow, slow, slow), beyond=share[0], frequency=frequency)
+    assert f"and 69 % of its power is above {frequency:.2g} Hz" in filtered.sentence
+    assert f"Lower the cutoff in [signals], as far as {frequency:.2g} Hz" in filtered.sentence
+    assert "cutoff in" not in replace(filtered, beyond=0.2).sentence
 
 
 def test_a_residual_is_examined_without_outliers_of_the_samples_used(rng):

@@ -14,29 +14,21 @@ from robotid.base.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.data.log import Log
 from robotid.dynamics.simulation.loops import (
     ClosedLoopRobot,
-    Loops,
     Window,
     cut_windows,
+    open_loops,
     why_no_solution,
 )
+from robotid.robot import drives
 from robotid.robot.drives import (
-    Asymmetric,
     Coulomb,
-    Counterbalance,
-    Cubic,
-    Harmonic,
-    Hat,
     Lag,
     LoadFriction,
     LuGre,
     Offset,
     PositionCoulomb,
-    Power,
     Presliding,
-    Ramp,
-    Spring,
     Stribeck,
-    Tanh,
     Viscous,
 )
 from robotid.robot.examples import example_urdf
@@ -49,10 +41,10 @@ PLAIN = (Viscous(), Coulomb(), Offset())
 #: Every term that a roll-out has, the load of the gear last.
 TERMS = (
     *PLAIN, PositionCoulomb(order=1, centre=0.1), PositionCoulomb(order=2, centre=0.1),
-    Stribeck(speed=0.2), Asymmetric(), Cubic(), Tanh(speed=0.3), Harmonic(order=3),
-    Harmonic(order=2, is_sine=True), Power(exponent=1.3), Ramp(low=0.1, high=0.9), Spring(),
-    Hat(at=0.1, before=-0.3, after=0.4), Counterbalance(arm=0.5, base=1.2, angle=0.2, rest=0.3),
-    LoadFriction(),
+    Stribeck(speed=0.2), drives.Asymmetric(), drives.Cubic(), drives.Tanh(speed=0.3),
+    drives.Harmonic(order=3), drives.Harmonic(order=2, is_sine=True), drives.Power(exponent=1.3),
+    drives.Ramp(low=0.1, high=0.9), drives.Spring(), drives.Hat(at=0.1, before=-0.3, after=0.4),
+    drives.Counterbalance(arm=0.5, base=1.2, angle=0.2, rest=0.3), LoadFriction(),
 )  # fmt: skip
 VALUES = (
     0.1, 0.2, 0.05, 0.1, 0.15, 0.08, 0.03, 0.002, 0.1, 0.04, 0.03, 0.05, 0.1, 0.2, 0.1, 0.2, 0.1,
@@ -71,18 +63,12 @@ def legs():
 
 
 def loops_of(model, terms=PLAIN, values=VALUES, *, kp=20.0, **changes):
-    n = len(model.joints)
-    found = Loops(
-        bodies=model.standard_parameters()[: model.layout.n_inertial].reshape(-1, 10),
-        armature=np.linspace(0.01, 0.02, n),
-        kp=np.full(n, kp),
-        kd=np.full(n, 0.06 * kp),
-        limit=np.full(n, np.inf),
-        delay=np.zeros(n),
-        zero=np.linspace(0.05, -0.05, n),
-        terms=(tuple(terms),) * n,
+    n, bare = len(model.joints), open_loops(model, model.standard_parameters())
+    found = replace(
+        bare, armature=np.linspace(0.01, 0.02, n), kp=np.full(n, kp), kd=np.full(n, 0.06 * kp),
+        zero=np.linspace(0.05, -0.05, n), terms=(tuple(terms),) * n,
         values=np.tile(values[: len(terms)], n),
-    )
+    )  # fmt: skip
     return replace(found, **changes)
 
 
@@ -243,7 +229,8 @@ def differences(robot, loops, windows, change, h):
 )
 def test_sensitivities_are_those_of_differences(request, name, rate, terms):
     model = request.getfixturevalue(name)
-    robot, windows = ClosedLoopRobot(model), cut_windows(commanded(model, 0.12), np.inf, 0.0)
+    log = replace(commanded(model, 0.12), gain_factors=np.array([[1.1], [0.8]]))
+    robot, windows = ClosedLoopRobot(model), cut_windows(log, np.inf, 0.0)
     size = 1.0 if name == "legs" else 30.0
     n, kinds = len(model.joints), robot.kinds
     values = VALUES if terms is TERMS else (0.1, 0.05, 0.1, 0.15, 0.1)
@@ -426,7 +413,9 @@ def test_sensitivities_by_the_start_are_those_of_differences(legs, rate):
 
 def test_lanes_know_nothing_of_each_other(legs):
     log = commanded(legs, 0.5)
-    robot, windows = ClosedLoopRobot(legs), cut_windows(log, 0.042, 0.01)
+    stiff = replace(log, gain_factors=np.array([[2.0], [1.4]]))
+    robot = ClosedLoopRobot(legs)
+    windows = [w for x in (log, stiff, log) for w in cut_windows(x, 0.042, 0.01)]
     assert len(windows) > 8, "more than a block of lanes"
     column = [(robot.kinds["kp"], 4, 0)]
     together = robot.roll_out(loops_of(legs), windows, column)

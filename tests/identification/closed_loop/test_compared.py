@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.mujoco_plant import plant, recorded
+from helpers.mujoco_plant import assert_recovered, plant, recorded
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
@@ -37,23 +37,14 @@ def fitted(leg, loop=LOOP, **changes):
     return fit_loops(robot.model, [log], loop, settings(**changes), chooses=False)
 
 
-def assert_recovered(robot, estimate, gains):
-    for name, value, std in zip(estimate.names, estimate.theta, estimate.std_error, strict=True):
-        truth = gains.get(name.rpartition(".")[2], robot.truth.get(name))
-        assert abs(value - truth) < 4 * std, name
-        if truth and not name.endswith("delay"):
-            assert std < 0.2 * truth, name
-
-
 def test_gains_and_delay_are_found_from_positions_and_torques(leg):
     robot, rng = leg[0], np.random.default_rng(4)
     fast, _ = recorded(robot, rng, duration=2.0, torque=TORQUE, step=1e-4, highest=6.0)
     found = fitted((robot, fast), LoopSettings(), torques=True)
     assert found.simulator.knows_torques
     np.testing.assert_array_equal(found.simulator.lag, np.full(3, 3))
-    gains = {"kp": KP, "kd": KD, "delay": DELAY}
-    assert {name.rpartition(".")[2] for name in found.estimate.names} > set(gains)
-    assert_recovered(robot, found.estimate, gains)
+    assert {name.rpartition(".")[2] for name in found.estimate.names} > {"kp", "kd", "delay"}
+    assert_recovered(found.estimate, robot.truth | {"robot.delay": DELAY}, 4.0, 0.2)
 
 
 def test_speeds_that_are_better_than_positions_make_it_surer(leg):
@@ -65,7 +56,7 @@ def test_speeds_that_are_better_than_positions_make_it_surer(leg):
     surer = estimate.std_error / plain.estimate.std_error
     assert np.median(surer[[not name.endswith("offset") for name in names]]) < 0.8
     for found in (plain, both):
-        assert_recovered(leg[0], found.estimate, {})
+        assert_recovered(found.estimate, leg[0].truth, 4.0, 0.2)
 
 
 def test_the_time_of_a_long_fit_is_stated_before_it_begins(leg, monkeypatch, caplog):

@@ -34,6 +34,7 @@ def simulator():
     rng = np.random.default_rng(0)
     robot = plant("leg", rng)
     log, _ = recorded(robot, rng, duration=0.5, torque=0.1, speed=0.01)
+    log = replace(log, gain_factors=np.array([[1.2, 0.9, 1.1], [0.8, 1.0, 1.3]]))
     looped = ClosedLoopRobot(robot.model)
     base = replace(
         stated_loops(robot.model, LoopSettings(kp=20.0, kd=1.5)),
@@ -105,8 +106,8 @@ def test_slopes_of_residuals_are_those_of_differences(simulator, rng, compared):
         size = np.repeat(size.reshape(-1, 3).max(axis=1), 3)  # of positions, speeds, torques
         assert (np.abs(slopes[..., k] - exact).max(axis=0) <= close * size).all(), name
     if compared == "all":
-        rolled = zip(simulator.roll_out(theta), plain, strict=True)
-        logged = [out.window.log.tau[out.window.counted] - r.e[:, 6:] for out, r in rolled]
+        both = zip(simulator.windows, plain, strict=True)
+        logged = [w.log.tau[w.counted] - r.e[:, 6:] for w, r in both]
         given = np.concatenate(logged)
         at_limit = np.isclose(np.abs(given), 0.3)
         assert 0.02 < at_limit[:, 1:].mean() < 0.9, "drives are at their limit, and are not"
@@ -193,7 +194,7 @@ def test_what_drives_give_follows_commands_whole_or_broken_rows_late():
     rng = np.random.default_rng(2)
     q, v, q_ref, v_ref, tau_ref = rng.standard_normal((5, 9, 2))
     log = Log(5.0 + np.arange(9) / 100, q, 0 * q, ("a", "b"), q_ref=q_ref, v_ref=v_ref,
-              tau_ref=tau_ref, has_torque=False)  # fmt: skip
+              tau_ref=tau_ref, has_torque=False, gain_factors=[[2.0, 0.5], [1.0, 3.0]])  # fmt: skip
     window = Window(log, 0, 2, 8)
     out = RollOut(window, q[2:8], v[2:8])
     kp, kd, limit = np.array([3.0, 5.0]), np.array([0.7, 0.2]), np.array([2.0, np.inf])
@@ -208,7 +209,8 @@ def test_what_drives_give_follows_commands_whole_or_broken_rows_late():
             def told(x, j=j, at=at):
                 return np.interp(at, np.arange(9), x[:, j])
 
-            reach, rate = told(q_ref) - q[2:8, j], told(v_ref) - v[2:8, j]
+            more, harder = log.gain_factors[:, j]
+            reach, rate = more * (told(q_ref) - q[2:8, j]), harder * (told(v_ref) - v[2:8, j])
             asked = kp[j] * reach + kd[j] * rate + told(tau_ref)
             np.testing.assert_allclose(found.position_error[:, j], reach)
             np.testing.assert_allclose(found.speed_error[:, j], rate)

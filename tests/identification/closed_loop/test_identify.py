@@ -1,9 +1,10 @@
+import tomllib
 from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.mujoco_plant import held, multisine, plant, recorded
+from helpers.mujoco_plant import assert_recovered, held, multisine, plant, recorded
 
 from robotid.data.log import Log
 from robotid.diagnosis.catalogue import finding
@@ -14,7 +15,7 @@ from robotid.identification.closed_loop.from_commands import (
     loop_findings,
     with_gravity,
 )
-from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.closed_loop.loop_settings import LogGains, LoopSettings
 from robotid.identification.closed_loop.position_errors import run_open_loop
 from robotid.identification.closed_loop.stages import fit_loops, stated_loops
 from robotid.output.files.entries import build_result
@@ -29,9 +30,7 @@ SLOW = finding("slow_command", "log", "hip", frequency=2.0, shortest=0.0, longes
 
 
 def stated(robot, **changes):
-    drives = robot.drives
-    gains = {"kp": {d.joint: d.kp for d in drives}, "kd": {d.joint: d.kd for d in drives}}
-    return LoopSettings(**({"delays": "group"} | gains | changes))
+    return LoopSettings(**({"delays": "group"} | robot.gains | changes))
 
 
 @pytest.fixture(scope="module")
@@ -60,15 +59,12 @@ def scaleless(leg):
 
 
 def test_the_drives_of_a_leg_are_recovered_within_their_errors(leg, found):
-    truth, estimate = leg[0].truth, found.fit.estimate
+    estimate = found.fit.estimate
     assert estimate.converged
     assert {name.rpartition(".")[2] for name in estimate.names} == {
         "armature", "viscous", "coulomb", "offset", "delay",
     }  # fmt: skip
-    for name, value, error in zip(estimate.names, estimate.theta, estimate.std_error, strict=True):
-        assert abs(value - truth[name]) < 3.3 * error, name
-        if not name.endswith("offset"):  # which is 0
-            assert error < 0.15 * truth[name], name
+    assert_recovered(estimate, leg[0].truth)
     windows = found.fit.simulator.windows
     assert {len(window.log.t) for window in windows} == {len(leg[1].t)}, "kept ones are not fitted"
 
@@ -250,18 +246,37 @@ def test_a_delay_at_its_bound_leaves_the_warning_of_a_slow_command(found):
     assert "bound" in sources
 
 
-def test_a_log_with_other_gains_is_named_with_their_ratio(leg, found):
-    """The gains of the hip stay, the others are three times and a third as large."""
-    drives, ratios = leg[0].drives, (1.0, 3.0, 1 / 3)
-    changed = [replace(d, kp=x * d.kp, kd=x * d.kd) for d, x in zip(drives, ratios, strict=True)]
-    other = replace(leg[0], drives=tuple(changed))
-    log, _ = recorded(other, np.random.default_rng(5), duration=1.0, noise=NOISE)
-    run = run_open_loop(found.fit.simulator.robot, found.fit.loops, log)
+RATIOS = np.array([[1.0, 3.0, 1 / 3], [1.0, 2.0, 1 / 3]])  # of kp and kd
+
+
+@pytest.fixture(scope="module")
+def other_log(leg):
+    """A log in which the drives but that of the hip have other gains."""
+    both = zip(leg[0].drives, RATIOS.T, strict=True)
+    drives = tuple(replace(d, kp=x * d.kp, kd=y * d.kd) for d, (x, y) in both)
+    changed = replace(leg[0], drives=drives)
+    return recorded(changed, np.random.default_rng(5), duration=1.0, noise=NOISE)[0]
+
+
+def test_free_gains_are_recovered_from_logs_with_stated_ratios(leg, other_log):
+    logs, truth = [leg[1], replace(other_log, gain_factors=RATIOS)], dict(leg[0].truth)
+    loop = stated(leg[0], kp=None, kd=None)
+    estimate = fit_loops(leg[0].model, logs, loop, SETTINGS, chooses=False).estimate
+    hip, *others = leg[0].model.joints  # a kd that is the same in both logs is viscous friction
+    truth[f"{hip}.viscous"] += truth.pop(f"{hip}.kd")
+    assert {x for x in estimate.names if x.endswith("kd")} == {f"{x}.kd" for x in others}
+    assert_recovered(estimate, truth)
+
+
+def test_a_log_with_other_gains_is_named_with_their_ratio(found, other_log):
+    run = run_open_loop(found.fit.simulator.robot, found.fit.loops, other_log)
     findings = loop_findings(replace(found, validation=(run,)), ())
     named = {one.joints: one for one in findings if one.code == "other_gains"}
-    assert list(named) == [(joint,) for joint in log.joints[1:]]
-    for one, ratio in zip(named.values(), ratios[1:], strict=True):
-        assert abs(one.evidence["ratio"] / ratio - 1) < 0.15
+    assert list(named) == [(joint,) for joint in other_log.joints[1:]]
+    for one in named.values():
+        entry = tomllib.loads(one.message.partition("of the job: ")[2])["controller"]
+        gains = LogGains.from_dict(entry).factors(found.loop, other_log.joints)
+        np.testing.assert_allclose(gains, RATIOS, rtol=0.15)
         assert one.evidence["after"] < 0.3 * one.evidence["before"]
         assert "times its value in the fit: with other gains its position error" in one.message
     assert not [one for one in loop_findings(found, ()) if one.code == "other_gains"]

@@ -17,7 +17,6 @@ from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.identification.closed_loop.from_commands import identify_loops
 from robotid.identification.closed_loop.initial_values import (
     CLEAR,
-    SecondOrder,
     _Motion,
     find_encoders,
     fit_second_order,
@@ -59,14 +58,15 @@ def test_a_load_that_would_push_a_loop_the_wrong_way_does_not_count(rng):
 def test_an_initial_limit_is_the_friction_at_the_largest_speed_within_the_largest_torque(rng):
     model, t = RobotModel.from_urdf(URDF / "planar_2r.urdf"), np.arange(100) / 100.0
     q_ref, q = rng.uniform(-1.0, 1.0, (2, 100, 2))
-    log = Log(t, q, 0 * q, model.joints, q_ref=q_ref, has_torque=False)
+    more = np.array([[0.5, 2.0], [1.0, 1.0]])
+    log = Log(t, q, 0 * q, model.joints, q_ref=q_ref, has_torque=False, gain_factors=more)
     friction, one = {"viscous": np.array([2.0, 200.0]), "coulomb": np.array([1.0, 3.0])}, np.ones(2)
     plain = SimpleNamespace(
         loops=SimpleNamespace(kp=np.array([30.0, 20.0]), limit=np.inf), inertia=one, torque=one,
         shows_inertia=one > 0, friction=friction.__getitem__,
     )  # fmt: skip
     windows, has_gain = cut_windows(log, np.inf, 0.0), one > 0
-    of_errors = 0.8 * plain.loops.kp * np.abs(q_ref - q)[windows[0].counted].max(axis=0)
+    of_errors = 0.8 * plain.loops.kp * more[0] * np.abs(q_ref - q)[windows[0].counted].max(axis=0)
     for top, wanted in (
         ([0.0, 0.0], of_errors),
         ([0.5, 0.5], [2.0, of_errors[1]]),  # the second would need more than it ever gave
@@ -92,24 +92,6 @@ def test_the_limit_of_a_drive_that_bears_a_load_is_found_beyond_the_load(tmp_pat
     found = fit_second_order(robot, windows, loops, False, True).loops
     assert found.limit == pytest.approx(10.0, rel=1e-3)
     np.testing.assert_allclose(found.values, values, rtol=0.05)
-
-
-def test_the_model_of_some_joints_is_that_of_another_fit(rng):
-    base = stated_loops(RobotModel.from_urdf(URDF / "planar_2r.urdf"), LoopSettings(kp=1.0))
-    keys, terms = ("armature", "delay", "limit"), ((Viscous(), Coulomb(), Offset()),) * 2
-    models = []
-    for _ in range(2):
-        drawn = {key: rng.random(2) for key in keys}
-        loops = replace(base, terms=terms, values=rng.random(6), **drawn)
-        models.append(SecondOrder(loops, rng.random(2), rng.random(2)))
-    mixed, (one, other) = models[0].replaced(models[1], np.array([False, True])), models
-    for key in (*keys, "values"):
-        a, b, found = (getattr(x.loops, key) for x in (one, other, mixed))
-        np.testing.assert_array_equal(found, np.append(a[: len(a) // 2], b[len(a) // 2 :]))
-    np.testing.assert_array_equal(mixed.torque, one.torque)
-    np.testing.assert_array_equal(
-        mixed.inertia_error, [one.inertia_error[0], other.inertia_error[1]]
-    )
 
 
 AWAY = 0.5  # [rad] of the thigh's zero from the URDF's
@@ -153,10 +135,7 @@ def test_a_zero_is_found_to_the_grid_and_then_by_the_fit(moved):
     assert (first.zero[[0, 2]] == 0.0).all()
     assert first.next_zero[1] == 0.0  # that of the URDF, so gain and margin are of the same two
     np.testing.assert_allclose(first.gain, [0.0, 1.0 - 1.0 / (1.0 + first.margin[1]), 0.0])
-    drives = robot.drives
-    loop = LoopSettings(
-        kp={d.joint: d.kp for d in drives}, kd={d.joint: d.kd for d in drives}, zeros="find"
-    )
+    loop = LoopSettings(**robot.gains, zeros="find")
     found = identify_loops(robot.model, [log], [], loop, SETTINGS, chooses=False)
     zero = dict(zip(found.fit.estimate.names, found.fit.estimate.theta, strict=True))
     assert zero["FL_thigh_joint.zero"] == pytest.approx(AWAY, abs=0.03)
@@ -247,7 +226,7 @@ def test_a_chosen_term_with_negative_friction_is_dropped_and_the_fit_goes_on(mod
     found = identify_loops(model, [log], [], LoopSettings(kp=KP), SimulationSettings())
     [finding] = [f for f in found.findings if f.code.startswith("friction")]
     assert (finding.code, finding.severity, finding.where) == ("friction_dropped", "warning", "j")
-    assert "N m, expected 0 or more. The term was dropped" in finding.message
+    assert "rad, expected 0 or more. The term was dropped" in finding.message
     [tried] = [t for t in found.fit.tried if t.dropped]
     assert (tried.terms, tried.is_chosen) == (("stribeck",), False)
     assert [term.name for term in found.fit.loops.terms[0]] == ["viscous", "coulomb", "offset"]

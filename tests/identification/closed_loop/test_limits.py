@@ -41,19 +41,14 @@ def limited():
     return stepped(LIMIT)
 
 
-def gains(robot, **changes):
-    drives = robot.drives
-    kp, kd = ({d.joint: getattr(d, key) for d in drives} for key in ("kp", "kd"))
-    return LoopSettings(**({"kp": kp, "kd": kd} | changes))
-
-
 def test_a_drive_at_its_limit_has_it_found(limited):
     robot, log = limited
     calf = robot.model.joints[2]
     assert largest_speeds(log).keys() == {calf}
     coulomb = robot.drives[2].coulomb
     assert largest_speeds(log)[calf] == pytest.approx((LIMIT - coulomb) / VISCOUS, rel=0.15)
-    found = identify_loops(robot.model, [log], [], gains(robot), SETTINGS, chooses=False)
+    loop = LoopSettings(**robot.gains)
+    found = identify_loops(robot.model, [log], [], loop, SETTINGS, chooses=False)
     estimate = found.fit.estimate
     values = dict(zip(estimate.names, estimate.theta, strict=True))
     assert [name for name in values if name.endswith("limit")] == [f"{calf}.limit"]
