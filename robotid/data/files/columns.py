@@ -560,8 +560,8 @@ class Finder:
     ) -> DataError:
         """Return the error of absent quantities and joints: what was found, a table to complete."""
         has_time = self._find("time", self._clocks()) is not None
-        sought = ["time"] * (not has_time)
-        sought += [f"{kind}_{self._named(place)}" for kind, place in absent]
+        of_joints = [f"{kind}_{self._named(place)}" for kind, place in absent]
+        sought = of_joints if has_time else ["time", *of_joints]
         sizes = [name for name in names if name.startswith(_SIZES)]
         left = [x for x in names if x not in {*recognised.values(), *sizes}]
         nouns = dict.fromkeys(NOUNS[kind.removesuffix("m")] for kind, _ in absent)
@@ -585,11 +585,10 @@ class Finder:
         by_order, remedy = self._by_order(left, absent), self._remedy(absent)
         if has_time and not (by_order or others):
             return DataError(f"{text} {remedy}", code="missing_column")
-        lines = ['# time = "NAME"'] * ("time" not in recognised)
-        lines += [f"{toml_key(key)} = {quoted(x)}" for key, x in recognised.items()]
+        lines = [f"{toml_key(key)} = {quoted(x)}" for key, x in recognised.items()]
         lines += [f"{toml_key(key)} = {quoted(x)}  # by order" for key, x in by_order.items()]
-        lines += [f'# {toml_key(key)} = "NAME"' for key in map("_".join, absent)
-                  if key not in by_order]  # fmt: skip
+        open_keys = ["time"] * ("time" not in recognised) + [*map("_".join, absent)]
+        lines += [f'# {toml_key(key)} = "NAME"' for key in open_keys if key not in by_order]
         if by_order:
             remedy += (
                 ". If joints have other names in the log, this table pairs them by order: check "
@@ -605,8 +604,7 @@ class Finder:
         """Return the table of units that the names of columns have and nothing states, as lines."""
         angle = "deg" if any("deg" in _words(name) for name in columns.values()) else None
         units = {"time": clock_unit(columns.get("time", "")), "angle": angle}
-        stated = [(key, x) for key, x in units.items() if x and getattr(self.units, key) is None]
-        lines = [f"{key} = {quoted(unit)}" for key, unit in stated]
+        lines = [f"{k} = {quoted(x)}" for k, x in units.items() if x and not getattr(self.units, k)]
         return ["[units]  # by the names", *lines] if lines else []
 
     def _by_order(self, names: Sequence[str], absent: Sequence[tuple[str, str]]) -> dict[str, str]:

@@ -47,10 +47,9 @@ def export(result: Result, target: Path, *, step: float = 0.005) -> Written:
         values = [f"{drive.joint} {x:.4g}" for drive in of.commanded if (x := getattr(drive, key))]
         if values:
             notes.append(f"Isaac Lab lacks {words} ({listed(values)}); {remedy}")
-    notes += of.notes
     head = head_of("isaac", robot=json.dumps(of.model.name), version=__version__, file=target.name)
-    write_text(yaml_text(content, "\n".join([head, *notes])), target)
-    return of.written(target, notes=notes)
+    write_text(yaml_text(content, "\n".join([head, *notes, *of.notes])), target)
+    return of.written(target, notes=[*notes, *of.notes])
 
 
 def isaac_actuators(

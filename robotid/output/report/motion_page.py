@@ -34,7 +34,6 @@ _COLUMNS = (
     ("joint", "code", "joint"), ("at [s]", ".2f", "time"), ("value of limit", ".4g", "limit"),
     ("unit", "text", "unit"),
 )  # fmt: skip
-#: What a list of links of the check of collisions means.
 UNCHECKED = {
     "unread": "not checked, because no shape of these links can be read",
     "left_alone": "not checked, because these links touch by design",

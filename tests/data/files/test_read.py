@@ -179,7 +179,7 @@ REFUSED = {
     "misspelt": (dict(q_elbow=None, q_elbow2=ONE), {}, '\nq_elbow = "q_elbow2"  # by order$'),
     "no time": (dict(time=None, Clock=T), {}, "log has no column 'time'; columns found: q_shoulder"
                 ", q_elbow, tau_shoulder, tau_elbow. Other columns: Clock. Without time stamps, gi",
-                "the rate of the rows [Hz", '\n[columns]\n# time = "NAME"\nq_shoulder = "q_shoul'),
+                "the rate of the rows [Hz", '\n[columns]\nq_shoulder = "', '\n# time = "NAME"$'),
     "units in names": (dict(time=None, stamp_ms=T, q_elbow=None, q_elbow_deg=ONE), {}, "no column "
                        "'time'; columns", '\n[columns]\ntime = "stamp_ms"\n', 'w = "q_elbow_deg"\n',
                        '"\n[units]  # by the names\ntime = "ms"\nangle = "deg"$'),
