@@ -175,11 +175,6 @@ def held(plant, q_ref, rate, clock, settles=_SETTLES):
     return np.array(q)
 
 
-def followed(robot, q_ref, rate, settles=_SETTLES):
-    """Return the positions of MuJoCo's robot as of ``rolled_out``."""
-    return rolled_out(robot, q_ref, rate, settles)[0]
-
-
 def rolled_out(robot, q_ref, rate, settles=_SETTLES):
     """Return positions, forces and speeds of MuJoCo's robot, (N, n), at times of held commands.
 

@@ -125,7 +125,8 @@ def test_a_linear_plant_moves_as_the_robot_does(arm, ur5, rng):
     v += 0.5 * np.sign(v)  # away from 0, where the plant's friction is smooth
     ours = arm.acceleration(q, v, 20 * u, structural_mapping(ur5).to_base(pi))
     # wrist inertias of 0.1 kg m^2 multiply rounding of 50 N m
-    np.testing.assert_allclose(ours, RobotPlant(ur5, pi).acceleration(q, v, 20 * u), rtol=1e-9)
+    theirs = [RobotPlant(ur5, pi).acceleration(*one) for one in zip(q, v, 20 * u, strict=True)]
+    np.testing.assert_allclose(ours, theirs, rtol=1e-9)
 
 
 def test_proximity_is_the_gradient_of_the_criterion(rng):

@@ -325,9 +325,7 @@ class RobotPlant:
         return rate, end
 
     def acceleration(self, q: Array, v: Array, u: Array, F: Friction | None = None) -> Array:
-        """Return the acceleration D(q)^-1 (u - C(q, v)), (n,) or (N, n) (Tzvetkova, (11))."""
-        if q.ndim == 2:
-            return np.stack([self.acceleration(*one) for one in zip(q, v, u, strict=True)])
+        """Return the acceleration D(q)^-1 (u - C(q, v)), shape (n,) (Tzvetkova, (11))."""
         F = self.friction(q, v) if F is None else F
         sign = np.tanh(self.ratios @ v / _SIGN_SPEED)
         free = u - self.ratios.T @ (F.along * sign + F.rest)

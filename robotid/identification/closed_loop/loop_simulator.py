@@ -550,13 +550,13 @@ def choose(
         )
     place = {name: k for k, name in enumerate(simulator.names)}
     sets = [[place[free.name] for free in free_parameters] for free_parameters in offered]
-    H, g, rows = _folds(simulator, theta, estimator)
+    (H, g, rows), least = _folds(simulator, theta, estimator), simulator.bounds[0] - theta
     columns = sorted({*range(len(theta))}.difference(*sets))
     remaining, chosen = set(range(len(sets))), set[int]()
     gains: dict[int, float] = {}
     while remaining:
         left: dict[int, dict[int, Array]] = {}  # by joint, of each of its candidates
-        for s, removed in _gains(H, g, columns, {s: sets[s] for s in remaining}).items():
+        for s, removed in _gains(H, g, columns, {s: sets[s] for s in remaining}, least).items():
             left.setdefault(offered[s][0].joints[0], {})[s] = -removed
         rounds = [Round(np.zeros(len(H)), of_joint, len(H), rows) for of_joint in left.values()]
         gains |= {s: round_.share(s) for round_ in rounds for s in round_.left}
@@ -609,9 +609,12 @@ def _folds(
     return H, g, rows // len(simulator.robot.model.joints)
 
 
-def _gains(H: Array, g: Array, columns: list[int], sets: dict[int, list[int]]) -> dict[int, Array]:
+def _gains(
+    H: Array, g: Array, columns: list[int], sets: dict[int, list[int]], least: Array
+) -> dict[int, Array]:
     """Return by how much each set of further columns lowers the squares of each held-out fold."""
-    # all 0 if the other folds do not determine a parameter, as with short logs
+    # 0 if the least step is smaller than the bound allows, (c,); all 0 if the other folds do not
+    # determine a parameter, as with short logs
     gains = {s: np.zeros(len(H)) for s in sets}
     base = np.array(columns)
     for k, (H_k, g_k) in enumerate(zip(H, g, strict=True)):
@@ -628,6 +631,8 @@ def _gains(H: Array, g: Array, columns: list[int], sets: dict[int, list[int]]) -
             X = scipy.linalg.cho_solve(factor, B)
             S = H_f[np.ix_(further, further)] - B.T @ X
             y = np.linalg.lstsq(S, g_f[further] - B.T @ move, rcond=None)[0]
+            if (y < least[further]).any():
+                continue
             both, step = np.append(base, further), np.concatenate([move - X @ y, y])
             gains[s][k] = before - step @ H_k[np.ix_(both, both)] @ step + 2 * g_k[both] @ step
     return gains

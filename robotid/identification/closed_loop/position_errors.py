@@ -1,11 +1,12 @@
 """Positions simulated from the commands or torques of logs, their errors, and simpler models."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from robotid.base.exceptions import NotConvergedError
 from robotid.base.text import period
@@ -132,9 +133,9 @@ def run_open_loop(
     baselines |= {key: _error(robot, plain, log, length) for key, plain in (others or {}).items()}
     if is_driven:
         drifts = [np.outer(w.log.t[w.counted] - w.log.t[w.start_row], w.start[1]) for w in windows]
-        baselines["steady"] = _size(np.concatenate(moved) - np.concatenate(drifts))
+        baselines["steady"] = _rms(np.concatenate(moved) - np.concatenate(drifts))
     else:
-        baselines["command"] = _size(log.q_ref - log.q)
+        baselines["command"] = _rms(log.q_ref - log.q)
     lengths = [h for h in horizons if h < log.t[-1] - log.t[0]]
     errors = {h: _error(robot, loops, log, h) for h in lengths}
     return PositionEvaluation(
@@ -142,7 +143,7 @@ def run_open_loop(
         units=tuple("m" if x in robot.model.layout.prismatic else "rad" for x in log.joints), q=q,
         rmse=np.sqrt(np.nanmean((log.q - q) ** 2, axis=0)), baselines=baselines,
         horizons={h: error for h, error in errors.items() if error is not None},
-        spread=_size(np.concatenate(moved)) if is_driven else np.std(log.q, axis=0),
+        spread=_rms(np.concatenate(moved)) if is_driven else np.std(log.q, axis=0),
     )  # fmt: skip
 
 
@@ -152,16 +153,16 @@ def pool_positions(runs: Sequence[PositionEvaluation], *, moving: bool = False) 
     for j, joint in enumerate(runs[0].log.joints):
         if of_joint := [run for run in runs if not moving or run.moves[j]]:
             per_joint[joint] = _joint_metrics(of_joint, j)
-    return Metrics(per_joint, _mean(rmse for run in runs for rmse in run.rmse))
+    return Metrics(per_joint, float(_rms([x for run in runs for x in run.rmse])))
 
 
 def _joint_metrics(runs: Sequence[PositionEvaluation], j: int) -> JointMetrics:
-    rmse, size = (_mean(getattr(run, key)[j] for run in runs) for key in ("rmse", "spread"))
+    rmse, size = (float(_rms([getattr(x, key)[j] for x in runs])) for key in ("rmse", "spread"))
     moves = size > 0 and any(run.moves[j] for run in runs)
 
     def share(errors: Sequence[Array | None]) -> float | None:
         known = [error[j] for error in errors if error is not None]
-        return 100.0 * _mean(known) / size if moves and len(known) == len(runs) else None
+        return 100.0 * float(_rms(known)) / size if moves and len(known) == len(runs) else None
 
     left = (rmse / size) ** 2 if size > 0 else 1.0
     return JointMetrics(
@@ -172,13 +173,9 @@ def _joint_metrics(runs: Sequence[PositionEvaluation], j: int) -> JointMetrics:
     )  # fmt: skip
 
 
-def _mean(values: Iterable[float]) -> float:
-    """Return the root mean square."""
-    return float(np.sqrt(np.mean(np.square(list(values)))))
-
-
-def _size(e: Array) -> Array:
-    return np.asarray(np.sqrt(np.mean(e**2, axis=0)))
+def _rms(x: ArrayLike) -> Array:
+    """Return the root mean square over the rows."""
+    return np.asarray(np.sqrt(np.mean(np.square(x), axis=0)))
 
 
 def _error(robot: ClosedLoopRobot, loops: Loops, log: Log, length: float) -> Array | None:
@@ -187,4 +184,4 @@ def _error(robot: ClosedLoopRobot, loops: Loops, log: Log, length: float) -> Arr
         outs = robot.roll_out(loops, cut_windows(log, length, 0.0))
     except NotConvergedError:
         return None  # a baseline that cannot be simulated has no error
-    return _size(np.concatenate([o.window.log.q[o.window.counted] - o.q for o in outs]))
+    return _rms(np.concatenate([o.window.log.q[o.window.counted] - o.q for o in outs]))

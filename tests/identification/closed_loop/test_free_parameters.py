@@ -268,7 +268,12 @@ def test_gains_are_those_of_fits_to_the_other_folds(rng):
     parts = [(rng.standard_normal((rows, 5)), rng.standard_normal(rows)) for rows in (12, 9, 15)]
     H, g = (np.array(x) for x in zip(*((A.T @ A, A.T @ b) for A, b in parts), strict=True))
     sets = {7: [1], 9: [4, 3]}
-    found = _gains(H, g, [0, 2], sets)
+    least = np.full(5, -np.inf)
+    found = _gains(H, g, [0, 2], sets, least)
+    least[1] = np.inf
+    bounded = _gains(H, g, [0, 2], sets, least)
+    assert not bounded[7].any(), "every step is beyond the bound"
+    np.testing.assert_array_equal(bounded[9], found[9])
     for k, (A, b) in enumerate(parts):
         others = [part for i, part in enumerate(parts) if i != k]
         A_f, b_f = (np.concatenate(x) for x in zip(*others, strict=True))

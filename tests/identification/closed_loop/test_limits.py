@@ -18,11 +18,12 @@ DELAY = 0.008  # [s] of all drives
 SETTINGS = SimulationSettings(window=2.0, lead=0.2, bodies=0.0, step=4e-3)
 
 
-def stepped(limit):
-    """Return a leg whose calf gives so much at most, and its log of steps."""
+@pytest.fixture(scope="module")
+def limited():
+    """A leg whose calf has a limit, and its log of steps."""
     rng = np.random.default_rng(2)
     robot = plant("leg", rng, delay=DELAY)
-    calf = replace(robot.drives[2], effort_limit=limit, viscous=VISCOUS, kp=KP)
+    calf = replace(robot.drives[2], effort_limit=LIMIT, viscous=VISCOUS, kp=KP)
     robot = replace(robot, drives=(*robot.drives[:2], calf))
     away = (-1.0) ** np.arange(STEPS)[:, None] * rng.uniform(0.4, 0.8, (STEPS, 3))
     poses = robot.middle + robot.reach * away
@@ -34,11 +35,6 @@ def stepped(limit):
     q = q + 1e-4 * rng.standard_normal(q.shape)
     none = np.zeros_like(q)
     return robot, Log(t, q, none, robot.model.joints, q_ref=q_ref, has_torque=False)
-
-
-@pytest.fixture(scope="module")
-def limited():
-    return stepped(LIMIT)
 
 
 def test_a_drive_at_its_limit_has_it_found(limited):

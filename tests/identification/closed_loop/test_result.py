@@ -67,14 +67,6 @@ def test_errors_of_sums_are_those_of_their_parameters(found):
         assert error == (pytest.approx(size) if size > 0 else np.inf)
 
 
-def at_limit(found, limit, theta):
-    """Return the same with a limit in place of the first parameter."""
-    simulator = found.fit.simulator
-    others = replace(simulator, free_parameters=(limit, *simulator.free_parameters[1:]))
-    estimate = replace(found.estimate, theta=theta, names=("turn.limit", *NAMES[1:]))
-    return replace(found, fit=replace(found.fit, simulator=others, estimate=estimate))
-
-
 def test_a_limit_and_a_gain_at_their_lower_bound_are_findings(found):
     simulator, theta = found.fit.simulator, found.estimate.theta.copy()
     first, second, *others = simulator.free_parameters
@@ -102,8 +94,8 @@ def test_a_limit_and_a_gain_at_their_lower_bound_are_findings(found):
         f"saturates. The torque limit of the drive is estimated as 0.25 +- {error:.2g} N; at the"
         in (free.message)
     )
-    first = replace(limit, joints=(1,))
-    (other,) = [f for f in loop_findings(at_limit(found, first, theta), ()) if f.code == "limit"]
+    limit = replace(limit, joints=(1,))
+    (other,) = [finding for finding in said("turn.kp") if finding.code == "limit"]
     assert f"0.25 +- {error:.2g} N m; at the limit" in other.message
 
 

@@ -12,7 +12,7 @@ import pinocchio as pin
 import pytest
 import yaml
 from helpers.commanded_results import by_position, written_result
-from helpers.mujoco_plant import LEG, followed, loaded, multisine, plant, recorded
+from helpers.mujoco_plant import LEG, loaded, multisine, plant, recorded, rolled_out
 from helpers.paths import DOCS, ROOT
 
 from robotid.base.exceptions import DataError
@@ -83,12 +83,12 @@ def test_mujoco_follows_a_chirp_as_the_closed_loop_does(changes, commands):
     """Within 1 mrad of 0.6 to 1.3 rad at 5 rad/s; half of it are the steps of 1 ms."""
     leg = plant("leg", np.random.default_rng(1), **changes)
     wanted = reference(leg.drives, commands)
-    found = followed(loaded(leg, RATE, 1e-3, as_exported=True), commands, RATE, settles=0.3)
+    found, *_ = rolled_out(loaded(leg, RATE, 1e-3, as_exported=True), commands, RATE, settles=0.3)
     assert np.abs(found - wanted).max() < 1e-3
     assert np.abs(wanted - commands).max() > 0.05  # the drives matter
     for key in ("delay", "coulomb", "armature", "viscous", "kd"):  # and each of their figures
         other = replace(leg, drives=tuple(replace(d, **{key: 0.0}) for d in leg.drives))
-        missed = followed(loaded(other, RATE, 1e-3, as_exported=True), commands, RATE, settles=0.3)
+        missed, *_ = rolled_out(loaded(other, RATE, 1e-3, as_exported=True), commands, RATE, 0.3)
         assert np.abs(missed - wanted).max() > 2e-3, key
 
 
