@@ -1,6 +1,5 @@
 """Settings: keys, checks, help, pages and results derive from the fields that declare them."""
 
-import difflib
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields
@@ -8,7 +7,7 @@ from numbers import Real
 from typing import Any, ClassVar, Self, TypeGuard, get_args, get_origin
 
 from robotid.base.exceptions import SettingsError
-from robotid.base.findings import listed
+from robotid.base.findings import listed, suggestion
 
 
 @dataclass(frozen=True)
@@ -180,10 +179,9 @@ def check_keys(
     for key, value in table.items():
         at = f"{where}: {section}{key}"
         if key not in schema:
-            near = difflib.get_close_matches(key, schema, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else "."
             raise SettingsError(
-                f"{shown(at)[1:-1]} is not a known key{hint} Known: {listed(sorted(schema))}"
+                f"{shown(at)[1:-1]} is not a known key{suggestion(key, schema) or '.'} "
+                f"Known: {listed(sorted(schema))}"
             )
         wanted = schema[key]
         if isinstance(wanted, dict):

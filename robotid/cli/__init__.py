@@ -7,7 +7,6 @@ or None for 0. One with many flags also has MAIN_FLAGS and EXAMPLES, for its sho
 import argparse
 import atexit
 import ctypes
-import difflib
 import gc
 import io
 import os
@@ -150,6 +149,8 @@ class CommandParser(argparse.ArgumentParser):
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
         """Parse words; refuse a flag that a command does not have, with the nearest flag."""
+        from robotid.base.findings import suggestion
+
         options, unknown = super().parse_known_args(args, namespace)
         if not unknown or self._subparsers is not None:
             return options, unknown
@@ -159,9 +160,7 @@ class CommandParser(argparse.ArgumentParser):
             words = "is one word too many; a flag takes one word, as JOINT=NUMBER or A,B"
             self.error(f"{unknown[0]!r} {words}{hint}")
         known = [flag for action in self._actions for flag in action.option_strings]
-        if near := difflib.get_close_matches(flags[0], known, n=1):
-            hint = f"; did you mean {near[0]}?"
-        self.error(f"{flags[0]} is unknown{hint}")
+        self.error(f"{flags[0]} is unknown{suggestion(flags[0], known) or hint}")
 
     def error(self, message: str) -> NoReturn:
         """Print the arguments and a message, and exit with code 2."""
@@ -193,12 +192,12 @@ class CommandParser(argparse.ArgumentParser):
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:  # noqa: ANN401
         """Refuse a word that is not among the choices of an argument, with the nearest choice."""
+        from robotid.base.findings import suggestion
+
         if action.choices is None or value in action.choices:
             return
         known = [str(choice) for choice in action.choices]
-        near = difflib.get_close_matches(str(value), known, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else "."
-        wanted = ", ".join(known)
+        hint, wanted = suggestion(str(value), known) or ".", ", ".join(known)
         raise argparse.ArgumentError(action, f"{value!r} is unknown{hint} Known: {wanted}")
 
 

@@ -29,7 +29,7 @@ from robotid.design.excitation import (
 from robotid.design.limits import LIMITS, Course, MotionLimits
 from robotid.design.previews import Preview, Run, preview_logs
 from robotid.estimation.fitting.recorded import hold_log
-from robotid.output.report.motion_page import write_motion_page
+from robotid.output.report.motion_page import UNCHECKED, search_figures, write_motion_page
 from robotid.robot.model import RobotModel
 
 
@@ -113,10 +113,9 @@ def _designed(
     designer: Designer, settings: MotionSettings, progress: Callable[[int, float], None]
 ) -> Design:
     rng = np.random.default_rng(settings.seed)
-    if settings.kind == "sweeps":
-        return design_sweeps(designer, rng)
-    if settings.kind == "stands":
-        return design_stands(designer, rng)
+    if settings.kind in ROUTES:
+        design = design_sweeps if settings.kind == "sweeps" else design_stands
+        return design(designer, rng)
     return designer.design(rng, starts=settings.starts, seconds=settings.seconds, progress=progress)
 
 
@@ -210,17 +209,15 @@ def run(options: argparse.Namespace) -> None:
             job, options.out, settings,
             given=options.given, report=options.report, progress=progress,
         )  # fmt: skip
-    files = [options.out, options.report] if options.report else [options.out]
-    show_found(content, options, _show, files)
+    show_found(content, options, _show, [x for x in (options.out, options.report) if x])
 
 
 def _boxes(words: Sequence[str], flag: str) -> tuple[Box, ...]:
     """Return boxes that are given as NAME=x0,y0,z0,x1,y1,z1, two corners [m]."""
+    wanted = f"NAME=x0,y0,z0,x1,y1,z1, the lower and the upper corner [m], within {FARTHEST:g} m"
     boxes = []
     for word in words:
         name, _, corners = word.partition("=")
-        wanted = "NAME=x0,y0,z0,x1,y1,z1, the lower and the upper corner [m], "
-        wanted += f"within {FARTHEST:g} m"
         x = [number(text, flag, wanted, repr(word)) for text in corners.split(",")]
         if len(x) != 6 or not all(abs(place) <= FARTHEST for place in x):
             raise SettingsError(f"{flag} {word!r}: expected {wanted}")
@@ -260,15 +257,10 @@ MOTION = Flags(
 
 
 def _show(content: dict[str, Any]) -> None:
-    done, count = f"in {content['seconds']:.1f} s", content["starts"]
-    if count:
-        end = "converged" if content["converged"] else "not converged: increase --seconds"
-        done = f"{count} {'start' if count == 1 else 'starts'} {done}, {end}"
-    condition = content["condition_number"]
+    condition, how = search_figures(content)
     echo(
         f"{content['robot']}: a motion of {content['duration']:g} s for {len(content['joints'])} "
-        f"joints, condition number {'infinite' if condition is None else format(condition, '.0f')} "
-        f"(regressor, columns in units of the prior); {done}"
+        f"joints, condition number {condition}; computed in {how}"
     )
     if "widest" in content:
         names = content["widest"]
@@ -276,6 +268,8 @@ def _show(content: dict[str, Any]) -> None:
     print("\nsmallest margin to each limit")
     for name, margin in content["limits"].items():
         echo(f"  {name:18} {_margin(name, margin)}", 21 * " ")
+    if "collision" not in content["limits"]:
+        echo(f"  {'collision':18} not checked (--clearance none)")
 
 
 def _margin(name: str, margin: Mapping[str, Any]) -> str:
@@ -285,10 +279,6 @@ def _margin(name: str, margin: Mapping[str, Any]) -> str:
     if margin["margin"] is not None:
         text = f"{1e3 * margin['margin']:5.1f} mm above the clearance of "
         text += f"{1e3 * margin['kept']:.0f} mm, {margin['where']} at {margin['time']:.2f} s"
-    for key, words in (
-        ("unread", "not checked, shapes not readable"),
-        ("left_alone", "not checked, in contact by design"),
-        ("built_near", "smaller clearance, close by design"),
-    ):
+    for key, words in UNCHECKED.items():
         text += f"; {words}: {listed(margin[key])}" if margin[key] else ""
     return text

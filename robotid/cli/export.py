@@ -94,7 +94,7 @@ def run(options: argparse.Namespace) -> None:
 def _show(content: dict[str, Any], *, is_verbose: bool) -> None:
     print(f"written: {', '.join(content['files'])}")
     notes = content["not_stated"]
-    for note in notes if is_verbose else ():
+    for note in notes if is_verbose else notes[:1]:  # the first: what the format drops
         echo(f"  {note}", "  ")
-    if notes and not is_verbose:
-        print(f"{len(notes)} note{'s' * (len(notes) > 1)} on this format (--verbose)")
+    if len(notes) > 1 and not is_verbose:
+        print(f"{len(notes) - 1} more note{'s' * (len(notes) > 2)} on this format (--verbose)")

@@ -62,7 +62,7 @@ def measure_payload(
     progress: ProgressCallback | None = None,
 ) -> dict[str, Any]:
     """Identify the payloads of the logs of a job, relative to references without payloads."""
-    entries = [LogEntry(Path(path)) for path in references]
+    given, entries = job.gains, [LogEntry(Path(path)) for path in references]
     if any(map(is_result, references)):
         if len(references) > 1:
             wanted = "expected one result alone, or logs"
@@ -71,7 +71,7 @@ def measure_payload(
         job, entries = job_of_result(job, references[0], advice)
     report_stage(progress, "reading logs", _STAGES)
     model = job.model()
-    unknown = [joint for joint in model.joints if joint not in job.gains] if find_gains else []
+    unknown = [joint for joint in model.joints if joint not in given] if find_gains else []
     job = replace(job, gains={**job.gains, **dict.fromkeys(unknown, 1.0)})
     links = tuple(links) or usual_links(model)
     surveyed = survey_logs(job, model, job.identification, entries)

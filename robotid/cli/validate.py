@@ -37,7 +37,7 @@ from robotid.estimation.fitting.evaluation import (
     hidden_joints,
     shares_rows,
 )
-from robotid.estimation.fitting.fit import sums_of_logs
+from robotid.estimation.fitting.fit import pinned_joints, sums_of_logs
 from robotid.estimation.fitting.recorded import Recordings, SurveyedLog
 from robotid.estimation.fitting.standard_errors import rms_error, torque_band
 from robotid.estimation.variation.groups import RunSums, runs_of
@@ -218,6 +218,7 @@ def _verdict(
             driven if any(log.head.has_torque for log in logs) else (),
             refitted=[e.recording.name for e in compress(evaluations, np.logical_not(is_new))],
             hidden=hidden_joints(model, evaluations),
+            pinned=pinned_joints(job.estimator.bounds, model),
         ),
         Determined(
             structure["undetermined"], result["consistency"]["is_consistent"],

@@ -171,12 +171,9 @@ def _check_degrees(log: Log, factor: Array) -> None:
 
 
 def _how_to_state(kind: str, unit: str, si: str, both: bool = False) -> str:
-    """Return how to state a unit, in the job file, on the command line and in Python."""
+    """Return how to state a unit, in the job file and on the command line."""
     stated = si if both else unit
-    ways = (
-        f'units {kind} = "{stated}" (job file table [units], CLI --{kind}-unit {stated}, '
-        f'Python units=LogUnits({kind}="{stated}"))'
-    )
+    ways = f'units {kind} = "{stated}" (job file table [units], CLI --{kind}-unit {stated})'
     if stated == si:
         return f"To read the values without conversion, set {ways}"
     return f'Set {ways}, or "{si}" if this is the unit'

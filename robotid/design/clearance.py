@@ -125,7 +125,7 @@ class Clearance:
         if not clouds:
             raise DataError(
                 f"{model.tree.path} has no shape that can be read, so collisions cannot be "
-                "checked; give it collision geometry, or design without clearance"
+                "checked; give it collision geometry, or omit the check (--clearance none)"
             )
         self._hulls = [_hull(name, body, points) for name, body, points in clouds]
         self._hulls += [_hull(box.name, -1, _corners(box)) for box in boxes]

@@ -58,7 +58,8 @@ class MotionLimits:
         if missing:
             raise SettingsError(
                 f"{Path(model.tree.path).name} has no limit of {listed(missing)}; add <limit lower "
-                "upper velocity effort>, give --max-velocity JOINT=X, or lock these joints"
+                'upper velocity effort>, set type="continuous" if a revolute joint has no position '
+                "limit, give a missing velocity as --max-velocity JOINT=X, or lock the joints"
             )
         middle = [(j.lower + j.upper) / 2 if j.has_limits else 0.0 for j in model.limits]
         half = [(j.upper - j.lower) / 2 if j.has_limits else _FREE for j in model.limits]

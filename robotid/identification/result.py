@@ -21,6 +21,7 @@ from robotid.diagnosis.verdict.verdict import (
 )
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.evaluation import Evaluated, Evaluation, Metrics, hidden_joints
+from robotid.estimation.fitting.fit import pinned_joints
 from robotid.estimation.fitting.fitted import Fit, Identified
 from robotid.estimation.variation.variation import Variation
 from robotid.identification.parameter_table import parameter_entries, parameter_table
@@ -186,6 +187,7 @@ class TorqueIdentification(Identification, Fit):
         predictions = Predictions(
             self.metrics(), self.predictions, driven if has_torque else (),
             refitted=[e.name for e in self.refitted], hidden=hidden_joints(model, self.fitted),
+            pinned=pinned_joints(self.estimator.bounds, model),
         )  # fmt: skip
         sources = list(zip(model.layout.names, self.sources, strict=True))
         by_prior = [name for name, x in sources[model.layout.n_inertial :] if x == "prior"]

@@ -19,6 +19,7 @@ WORDS = [
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        (["--clearance", "none", "--floor", "0"], "clearance is none, expected metres: a floor or"),
         (["--clearance", "near"], "--clearance 'near': expected metres, or none"),
         (["--box", "post=1,2,3"], "--box 'post=1,2,3': expected NAME=x0,y0,z0,x1,y1,z1"),
         (["--duration", "-1"], "duration is -1.0, expected 0.1 to 3600 s"),
@@ -56,9 +57,9 @@ def test_after_a_result_a_motion_is_made_for_what_it_knows_the_least(tmp_path, c
     assert main(["identify", robot[0], log, *robot[1:], "--out", out, *plain]) == 0
     capsys.readouterr()
     assert main([*words, "--given", out]) == 0
-    assert "designed for the parameters with the widest intervals: " in " ".join(
-        capsys.readouterr().out.split()
-    )
+    said = " ".join(capsys.readouterr().out.split())
+    assert "designed for the parameters with the widest intervals: " in said
+    assert " collision not checked (--clearance none) written: " in said
     assert main([*words, "--given", out, "--json"]) == 0
     content = json.loads(capsys.readouterr().out)
     assert content["criterion"] == "widest"
@@ -124,6 +125,16 @@ def test_a_box_is_kept_away_from_and_a_seed_makes_the_same_motion_again(pan_tilt
     assert "floor" in low["limits"]["collision"]["where"]
 
 
+def test_a_missing_position_range_has_a_remedy_that_works(pan_tilt, capsys):
+    text = pan_tilt.read_text().replace('lower="-1" upper="1" ', "")
+    command = ["excite", str(pan_tilt), "--out", str(pan_tilt.with_name("m.csv")), "--seconds=0.01"]
+    for kind, code in (("revolute", 2), ("continuous", 0)):
+        pan_tilt.write_text(text.replace('"b" type="revolute"', f'"b" type="{kind}"'))
+        assert main(command) == code
+    wanted = 'no limit of b (position); add <limit lower upper velocity effort>, set type="contin'
+    assert wanted in capsys.readouterr().err
+
+
 def test_a_format_that_motions_are_not_written_in_is_refused_before_the_design(tmp_path, capsys):
     urdf = str(example_urdf("ur5_robot.urdf"))
     assert main(["excite", urdf, "--out", str(tmp_path / "motion.txt")]) == 1
@@ -134,24 +145,18 @@ def test_a_format_that_motions_are_not_written_in_is_refused_before_the_design(t
 
 def test_every_flag_states_its_setting():
     """Each with a value that is not the default, two where the flag is repeatable."""
-    words = {
-        "kind": "sweeps", "duration": "4", "harmonics": "3", "criterion": "E", "share": "0.5",
-        "clearance": "0.1", "floor": "-0.2", "seed": "7", "starts": "2", "seconds": "9",
-        "points": "50",
+    stated = {
+        "kind": "sweeps", "duration": 4.0, "harmonics": 3, "criterion": "E", "share": 0.5,
+        "clearance": 0.1, "floor": -0.2, "seed": 7, "starts": 2, "seconds": 9.0, "points": 50.0,
     }  # fmt: skip
-    line = [word for name, value in words.items() for word in (f"--{name}", value)]
-    limits = [f"--max-{x}" for x in ("velocity", "torque", "acceleration", "jerk", "power")]
-    for flag in (*limits, "--noise"):
+    line = [f"--{name}={value}" for name, value in stated.items()]
+    limits = ("velocity", "torque", "acceleration", "jerk", "power")
+    for flag in (*[f"--max-{x}" for x in limits], "--noise"):
         line += [flag, "one=3", flag, "two=0.5"]
     line += ["--box", "post=0,1,2,3,4,5", "--box", "wall=-1,0,0,0,1,1"]
-    found = stated_by_flags(*line)
-    each = {"one": 3.0, "two": 0.5}
-    assert found == MotionSettings(
-        kind="sweeps", duration=4.0, harmonics=3, criterion="E", share=0.5, clearance=0.1,
-        floor=-0.2, seed=7, starts=2, seconds=9.0, points=50.0,
-        velocity=each, torque=each, acceleration=each, jerk=each, power=each, noise=each,
-        boxes=(Box("post", (0, 1, 2), (3, 4, 5)), Box("wall", (-1, 0, 0), (0, 1, 1))),
-    )  # fmt: skip
+    stated |= {x: {"one": 3.0, "two": 0.5} for x in (*limits, "noise")}
+    boxes = (Box("post", (0, 1, 2), (3, 4, 5)), Box("wall", (-1, 0, 0), (0, 1, 1)))
+    assert stated_by_flags(*line) == MotionSettings(**stated, boxes=boxes)
     assert stated_by_flags("--clearance", "none").clearance is None
     assert stated_by_flags() == MotionSettings()
 

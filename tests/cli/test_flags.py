@@ -40,8 +40,7 @@ def test_every_setting_of_the_signals_has_a_flag():
               if name not in ("rate", "max_gap")}  # fmt: skip
     assert set(words) == set(SignalSettings.paths())
     for command in (identify, doctor):
-        found = job(command, *flags).signals
-        assert found == SignalSettings(rate=200.0, max_gap=0.3, **stated)
+        assert job(command, *flags).signals == SignalSettings(rate=200.0, max_gap=0.3, **stated)
 
 
 def test_every_other_flag_states_its_key_too():
@@ -154,13 +153,13 @@ def printed(capsys, *words):
     [
         (
             ["identify", "r.urdf", "l.csv", "--vaildate", "b.csv", "--x"],
-            "unknown; did you mean --va",
+            "unknown. Did you mean '--va",
         ),
         (["inspect", "r.urdf", "x"], "'x' is one word too many; a flag takes one word"),
         (["replay", "r.urdf", "l.csv", "--xyz=3"], "--xyz is unknown; see 'robotid replay --help'"),
-        (["identfy", "robot.urdf"], "argument COMMAND: 'identfy' is unknown; did you mean 'ident"),
-        (["export", "r.json", "--format", "mjfc", "--out", "x"], "'mjfc' is unknown; did you mean"),
-        (["excite", "r.urdf", "--out", "x", "--kind", "furier"], "did you mean 'fourier'? Known: "),
+        (["identfy", "robot.urdf"], "argument COMMAND: 'identfy' is unknown. Did you mean 'ident"),
+        (["export", "r.json", "--format", "mjfc", "--out", "x"], "'mjfc' is unknown. Did you mean"),
+        (["excite", "r.urdf", "--out", "x", "--kind", "furier"], "Did you mean 'fourier'? Known: "),
     ],
 )
 def test_a_misspelt_word_is_answered_with_the_nearest_one(capsys, words, near):

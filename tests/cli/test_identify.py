@@ -212,5 +212,4 @@ def test_a_renamed_project_works(arm, tmp_path, monkeypatch, capsys):
     assert "old" in json.loads((new / "out" / "result.json").read_text())["settings"]["urdf"]
     (new / "logs" / "fit.csv").write_text("another log")
     assert main(["preview", urdf, str(new / "logs/later.csv"), "--given", result]) == 1
-    said = " ".join(capsys.readouterr().err.split())
-    assert f"{old / 'logs/fit.csv'}, a fitted log of" in said
+    assert f"{old / 'logs/fit.csv'}, a fitted log of" in " ".join(capsys.readouterr().err.split())

@@ -111,8 +111,7 @@ def test_every_key_of_a_job_arrives(tmp_path):
 
 def test_settings_written_into_a_result_are_the_same_job(tmp_path):
     job = read_job(write(tmp_path, FULL))
-    again = job_from_settings(job.to_dict(), "result.json", Path())
-    assert again == job
+    assert job_from_settings(job.to_dict(), "result.json", Path()) == job
     off = read_job(write(tmp_path, FULL.replace("cutoff = 8.0", "cutoff = false")))
     assert off.signals.cutoff is None
     assert job_from_settings(off.to_dict(), "result.json", Path()) == off
@@ -129,8 +128,8 @@ def test_paths_may_name_environment_variables(tmp_path, monkeypatch):
 
 CONSTRAINTS = '"consistent"\n[estimator.constraints]\n'
 WRONG = {
-    "misspelt key": ("order = 4", "ordr = 4", "ordr is not a known key; did you mean 'order'?"),
-    "misspelt table": ("[signals]", "[signal]", "known key; did you mean 'signals'?"),
+    "misspelt key": ("order = 4", "ordr = 4", "ordr is not a known key. Did you mean 'order'?"),
+    "misspelt table": ("[signals]", "[signal]", "known key. Did you mean 'signals'?"),
     "text for a number": ("trim = 0.2", 'trim = "0.2"', "signals.trim is '0.2', expected a number"),
     "cutoff true": ("cutoff = 8.0", "cutoff = true", "cutoff is true, expected a frequency [Hz]"),
     "negative cutoff": ("cutoff = 8.0", "cutoff = -8.0", "cutoff is -8.0, expected 0.001 to 1e6"),
@@ -187,7 +186,7 @@ WRONG = {
     "deep": ("locked = { c = 0.8 }", f"locked = {'[' * 5000}", "is not valid TOML"),
     "NUL in a path": ('"robot.urdf"', '"robot\\u0000.urdf"', "is not a valid path"),
     "long path": ('"robot.urdf"', f'"{"r" * 5000}"', "is not a valid path, expected UTF-8"),
-    "misspelt topic": ("topic =", "topics =", "topics is not a known key; did you mean 'topic'?"),
+    "misspelt topic": ("topic =", "topics =", "topics is not a known key. Did you mean 'topic'?"),
     "gravity": ("[0.0, -9.81, 0.0]", "9.81", "9.81, expected a list of 3 numbers"),
     "no quotes": (
         'urdf = "robot.urdf"', "urdf = robot.urdf", ": urdf = robot.urdf. Text and paths need",

@@ -1,6 +1,7 @@
 """`robotid payload` and `robotid preview`: what a result and further logs determine."""
 
 import json
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -83,16 +84,21 @@ def test_a_log_and_a_result_are_references_alike(files, capsys):
     assert [entry.path for entry in references] == [files / "bare.csv"]
 
 
-def test_a_job_states_a_check_of_the_scale_which_its_result_has(files):
+def test_a_job_states_a_check_of_the_scale_in_its_result(files, tmp_path, ur5, capsys, monkeypatch):
+    for name in ("bare", "loaded"):  # with a name and gains that only the job states
+        text = (files / f"{name}_currents.csv").read_text().replace("time", "stamp", 1)
+        (tmp_path / f"{name}.csv").write_text(text)
+    files, gains = tmp_path, dict(zip(ur5.joints, GAINS, strict=True))
     table = {
-        "urdf": ARM, "identification": [{"log": "bare.csv"}],
+        "urdf": ARM, "identification": [{"log": "bare.csv"}], "columns": {"time": "stamp"},
+        "torque": {"gains": gains},
         "model": {"friction": "viscous+coulomb"}, "output": {"report": False},
         "payload_check": [
             {"log": "loaded.csv", "mass": 1.8, "end": 3.0},
             {"log": "loaded.csv", "mass": 1.8, "link": "tool0"},
         ],
     }  # fmt: skip
-    found, _ = run_job(job_from_settings(table, "job.toml", files), files / "checked")
+    found, _ = run_job(job_from_settings(table, "job.toml", files), files / "out")
     check, other = found.scale_check.payloads  # the narrower interval first: the whole log
     widths = [high - low for low, high in (check.interval, other.interval)]
     assert 1.4 * widths[0] < widths[1]
@@ -104,7 +110,7 @@ def test_a_job_states_a_check_of_the_scale_which_its_result_has(files):
     (reason,) = [r for r in found.verdict.reasons if "payload of known mass" in r]
     assert check.message in reason
     assert f"{other.message[0].upper()}{other.message[1:]}" in reason or other.message in reason
-    whole = load_result(files / "checked").content
+    whole = load_result(files / "out").content
     assert stated_scale_check(whole).payloads == (check, other)
     assert job_from_settings(whole["settings"], "x", files).payload_checks == (
         found.stated.job.payload_checks
@@ -113,10 +119,13 @@ def test_a_job_states_a_check_of_the_scale_which_its_result_has(files):
         s for s in next_steps(found, Origin(("job.toml",), "out")) if "torque scale" in s.words
     ]
     assert step.words.startswith("Correct the torque scale: payload of 1.8 kg on tool0")
-    urdf, bare, loaded = found.model.tree.path, files / "bare.csv", files / "loaded.csv"
+    urdf, loaded = found.model.tree.path, files / "loaded.csv"
     assert step.blocks[0] == (
-        f"robotid payload {urdf} {loaded} --reference {bare} --link tool0 --mass 1.8 --gains"
+        f"robotid payload {urdf} {loaded} --reference out --link tool0 --mass 1.8 --gains"
     )
+    monkeypatch.chdir(files)
+    assert main(shlex.split(step.blocks[0])[1:]) == 0
+    assert "[torque.gains]\nshoulder_pan_joint = 1" in capsys.readouterr().out
     typed = Origin((str(urdf), "bare.csv", "--gain", "elbow_joint=3", "--cutoff", "8"), "out")
     (step,) = [s for s in next_steps(found, typed) if "torque scale" in s.words]
     assert step.blocks[1:] == (
@@ -217,8 +226,7 @@ def test_the_window_of_a_job_is_previewed(files, capsys):
 
 def test_wrong_words_are_answered(files, capsys):
     motion = files / "bare_motion.csv"
-    error = previewed(capsys, motion, "--noise", "elbow=1", code=2)
-    assert "Did you mean 'elbow_joint'" in error
+    assert "Did you mean 'elbow_joint'" in previewed(capsys, motion, "--noise", "elbow=1", code=2)
     assert "expected JOINT=NUMBER" in previewed(capsys, motion, "--noise", "elbow_joint", code=2)
     error = previewed(capsys, motion, "--given", files / "out", "--cutoff", "5", code=2)
     assert "a RESULT has the settings of its logs" in error

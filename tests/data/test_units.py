@@ -43,7 +43,7 @@ SUSPECTED = [
      "Negate one of them in the recording, or leave the dq columns out"),
     (dict(t=T * 1e3, v=None), "time_unit", "median step 10 looks like milliseconds (100 Hz); in "
      'seconds it would be 0.1 Hz. Set units time = "ms" (job file table [units], CLI --time-unit '
-     'ms, Python units=LogUnits(time="ms")), or "s" if this is the unit. To convert it, multiply'),
+     'ms), or "s" if this is the unit. To convert it, multiply'),
     (dict(t=T * 200.0 / 10, v=None), "time_unit", "median step 0.2 looks like milliseconds (5000"),
     (dict(t=T * 1e6, v=None), "time_unit", "median step 10000 looks like microseconds (100 Hz)"),
     (dict(t=T * 1e9, v=None), "time_unit", "median step 1e+07 looks like nanoseconds (100 Hz)"),

@@ -79,8 +79,7 @@ class _Bag:
         if count and not is_stamped:
             raise DataError(
                 f"{self.path.name}, topic {topic!r}: the header stamps of all {count} messages are "
-                '0. To use the time of recording, set stamp = "log" (job file table [log], CLI '
-                '--stamp log, Python source=LogSource(stamp="log"))'
+                '0. To use the time of recording, set stamp = "log" in [log] (CLI --stamp log)'
             )
 
 
@@ -417,8 +416,7 @@ def _with_sensors(
             if len(topics) > 1:
                 raise DataError(
                     f"{path.name} has {len(topics)} topics with {name}: {listed(topics)}. Set "
-                    f'all topics of sensors to read: sensors = ["{topics[0]}"] (job file table '
-                    "[log], Python source=LogSource(sensors=...))"
+                    f'all topics of sensors to read: sensors = ["{topics[0]}"] (in [log] of a job)'
                 )
         others = [name for name in wanted if name not in by_column and name != "time"]
         rows = states.read(["time", *others])

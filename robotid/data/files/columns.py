@@ -17,7 +17,7 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed, quoted, suggestion, toml_key
 from robotid.base.settings import is_number
 from robotid.data.log import repeated
-from robotid.data.signal_settings import LogSource, Transmission
+from robotid.data.signal_settings import PER_SECOND, LogSource, LogUnits, Transmission
 from robotid.robot.tree import Joint
 
 _QUANTITIES = {
@@ -158,6 +158,12 @@ def is_clock(name: str) -> bool:
     return tuple(word for word in _words(name) if word not in _NO_MEANING) in _CLOCKS
 
 
+def clock_unit(name: str) -> str | None:
+    """Return the unit at the end of the name of a column with time stamps, as of "time_ms"."""
+    words = [word for word in _words(name) if word not in _NO_MEANING]
+    return words[-1] if tuple(words[:-1]) in _CLOCKS and words[-1] in PER_SECOND else None
+
+
 def is_commanded(name: str) -> bool:
     """Return whether a column has a word for a command, or for the error of following one."""
     ends = (*_COMMANDED, "demand", "err")
@@ -274,20 +280,14 @@ class Finder:
     passive: Collection[str] = ()  # joints without a drive, which need no torque
     robot: Sequence[Joint] = ()  # all movable joints, in the order of the URDF
     moves: Callable[[str, str], bool] | None = None  # whether a joint moves, by its column
+    units: LogUnits = field(default_factory=LogUnits)
 
     def find_all(self) -> dict[str, list[str]]:
         """Return the columns to read: time, q, required quantities, complete optional ones."""
         self._check_arguments()
         self.notes.extend(self.reading.notes)
-        if (clock := self._find("time", self._clocks())) is None:
-            raise DataError(
-                f"{self.where} has no column 'time'; columns found: {listed(self.names)}. Rename "
-                'it, or set in the job file: columns = { time = "NAME" }, or without time stamps '
-                "the rate of the rows [Hz]: log = { rate = 100 }",
-                code="missing_column",
-            )
-        chosen, optional, wanted = {"time": [clock]}, ["dq", "ddq"], self._wanted()
-        self._require(wanted)
+        optional, wanted = ["dq", "ddq"], self._wanted()
+        chosen = {"time": [self._require(wanted)]}
         chosen["q"] = list(filter(None, map(self._find_of, *self._places("q"))))
         if "commands" in wanted:
             chosen["qref"] = list(filter(None, map(self._find_of, *self._places("qref"))))
@@ -526,8 +526,8 @@ class Finder:
 
     # --- a log that lacks required columns --------------------------------------------------------
 
-    def _require(self, wanted: Collection[str]) -> None:
-        """Reject a log without a required column of any joint."""
+    def _require(self, wanted: Collection[str]) -> str:
+        """Return the column of time stamps; reject a log without it or any joint's columns."""
         absent = [
             place
             for kind in ("q", *(["qref"] if "commands" in wanted else []))
@@ -542,12 +542,13 @@ class Finder:
                 and not (self.has(kind, name) or self.has(f"current{kind[3:]}", name))
             ]
         has_no_gain = any(self.has("current", x) and x not in self.gains for x in self.joints)
-        if not absent or (has_no_gain and all(kind == "tau" for kind, _ in absent)):
-            return  # the error of a missing gain names these joints, too
         clock = self._find("time", self._clocks())
+        if clock and (not absent or (has_no_gain and all(kind == "tau" for kind, _ in absent))):
+            return clock  # the error of a missing gain names these joints, too
         read = {*self.joints, *self.motors.values()}
         columns = self.reading.columns.items()
-        recognised = {"time": clock} if clock else {}
+        likely = next(filter(clock_unit, self.names), None)
+        recognised = {"time": name} if (name := clock or likely) else {}
         recognised |= {f"{kind}_{x}": own for (kind, x), (own, *_) in columns if x in read}
         recognised |= self.columns
         of_others = {name for (_, x), own in columns if x not in read for name in own}
@@ -558,19 +559,21 @@ class Finder:
         self, names: Sequence[str], absent: Sequence[tuple[str, str]], recognised: Mapping[str, str]
     ) -> DataError:
         """Return the error of absent quantities and joints: what was found, a table to complete."""
-        sought = [f"{kind}_{self._named(place)}" for kind, place in absent]
+        has_time = self._find("time", self._clocks()) is not None
+        of_joints = [f"{kind}_{self._named(place)}" for kind, place in absent]
+        sought = of_joints if has_time else ["time", *of_joints]
         sizes = [name for name in names if name.startswith(_SIZES)]
         left = [x for x in names if x not in {*recognised.values(), *sizes}]
         nouns = dict.fromkeys(NOUNS[kind.removesuffix("m")] for kind, _ in absent)
         ends = tuple(kind.replace("tau", t) + "_" for kind, _ in absent for t in ("tau", "current"))
-        of_kind = [column for key, column in recognised.items() if key.startswith(ends)]
+        of_kind = [column for key, column in recognised.items() if key.startswith(ends or "")]
         references = tuple(f"{kind.removesuffix('ref')}ref_" for kind, _ in absent)
         read = [x for key, x in recognised.items() if key.startswith(references)]
         commanded = [x for x in names if is_commanded(x) and x in {*left, *read}]
         others = [name for name in left if name not in commanded]
         named = f"column{'s' * (len(sought) > 1)} {listed(map(repr, sought), _SHOWN)}"
         text = (
-            f"{self.where} has no {named}; {' and '.join(nouns)} columns found: "
+            f"{self.where} has no {named}; {' and '.join(nouns)}{' ' * bool(nouns)}columns found: "
             f"{listed(of_kind, _SHOWN)}."
         )
         for label, some in (
@@ -580,12 +583,12 @@ class Finder:
         ):
             text += f" {label}: {listed(some, _SHOWN)}." if some else ""
         by_order, remedy = self._by_order(left, absent), self._remedy(absent)
-        if not (by_order or others):
+        if has_time and not (by_order or others):
             return DataError(f"{text} {remedy}", code="missing_column")
         lines = [f"{toml_key(key)} = {quoted(x)}" for key, x in recognised.items()]
         lines += [f"{toml_key(key)} = {quoted(x)}  # by order" for key, x in by_order.items()]
-        lines += [f'# {toml_key(key)} = "NAME"' for key in map("_".join, absent)
-                  if key not in by_order]  # fmt: skip
+        open_keys = ["time"] * ("time" not in recognised) + [*map("_".join, absent)]
+        lines += [f'# {toml_key(key)} = "NAME"' for key in open_keys if key not in by_order]
         if by_order:
             remedy += (
                 ". If joints have other names in the log, this table pairs them by order: check "
@@ -593,9 +596,16 @@ class Finder:
             )
         return DataError(
             f"{text} {remedy}. Rename the columns, or set them in the job file:\n[columns]\n"
-            + "\n".join(lines),
+            + "\n".join([*lines, *self._units_by_name({**recognised, **by_order})]),
             code="missing_column",
         )
+
+    def _units_by_name(self, columns: Mapping[str, str]) -> list[str]:
+        """Return the table of units that the names of columns have and nothing states, as lines."""
+        angle = "deg" if any("deg" in _words(name) for name in columns.values()) else None
+        units = {"time": clock_unit(columns.get("time", "")), "angle": angle}
+        lines = [f"{k} = {quoted(x)}" for k, x in units.items() if x and not getattr(self.units, k)]
+        return ["[units]  # by the names", *lines] if lines else []
 
     def _by_order(self, names: Sequence[str], absent: Sequence[tuple[str, str]]) -> dict[str, str]:
         """Return the columns of joints with other names by standard name, in their order."""
@@ -612,6 +622,8 @@ class Finder:
 
     def _remedy(self, absent: Sequence[tuple[str, str]]) -> str:
         """Return what to do if no column is similar to a missing one."""
+        if not absent:
+            return "Without time stamps, give the rate of the rows [Hz]: log = { rate = 100 }"
         if at_motors := [name for name in self.names if name.startswith(("qm_", "taum_"))]:
             return (
                 f"For columns of motors, as {at_motors[0]}, add [[transmission]] with joints "

@@ -191,8 +191,7 @@ _FEATURES: Mapping[str, Mapping[str, str]] = {
 _NORMALISED = (
     "LeRobot's files lack the unit of positions: degrees, or normalised positions, -100 to 100 "
     "over the calibrated range (a gripper: 0 to 100). Record normalised positions again with "
-    'use_degrees = true. For angles, set the unit: angle = "deg" or "rad" (job file table [units], '
-    'CLI --angle-unit deg, Python units=LogUnits(angle="deg"))'
+    'use_degrees = true. For angles, set angle = "deg" or "rad" in [units] (CLI --angle-unit deg)'
 )
 _Place = tuple[str, int]  # a feature, and the number of a value in its vectors
 

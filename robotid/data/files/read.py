@@ -353,7 +353,7 @@ def lay_out(
     finder = Finder(
         where, opened.names, of_joints, tuple(joints), gains or {}, source, tuple(transmissions),
         needs, notes, {*chain.from_iterable(of_base.values()), *opened.sensors}, passive,
-        tuple(robot), partial(_moves, opened, units, prismatic),
+        tuple(robot), partial(_moves, opened, units, prismatic), units,
     )  # fmt: skip
     joints = [joint for joint in joints if joint not in passive or finder.has("q", joint)]
     finder = replace(finder, joints=tuple(joints))

@@ -284,7 +284,7 @@ def choose(where: str, candidates: Sequence[str], noun: str, listing: str) -> st
     names = sorted(candidates)
     raise DataError(
         f"{where} has {len(names)} {noun}: {listed(names)}; {listing}. Set one: topic = "
-        f'"{names[0]}" (job file table [log], CLI --topic, Python source=LogSource(topic=...))'
+        f'"{names[0]}" (job file table [log], CLI --topic)'
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from robotid.base.exceptions import SettingsError
-from robotid.base.findings import Finding, listed, not_ignored, quoted
+from robotid.base.findings import Finding, listed, not_ignored, quoted, suggestion
 from robotid.base.settings import require_kind
 from robotid.diagnosis.catalogue import codes_with, reason_of, sentence_of
 from robotid.diagnosis.decisions import BETTER, NO_ERROR_OF_MASSES
@@ -54,6 +53,7 @@ class Predictions:
     joints: Sequence[str] = ()
     refitted: Sequence[str] = ()  # validation logs left out because they contain fitted samples
     hidden: Sequence[str] = ()  # joints not evaluated, of ``hidden_joints``; without metrics
+    pinned: Sequence[str] = ()  # joints whose links keep the URDF's values, of ``pinned_joints``
 
     @cached_property
     def fitted(self) -> dict[str, JointMetrics]:
@@ -104,7 +104,8 @@ class Predictions:
         """Return the joints that the URDF with fitted drives predicts better, and the remedy."""
         tested = (pair for metrics in self.tested.values() for pair in metrics.items())
         worse = dict.fromkeys(j for j, m in tested if is_beaten(m) and j not in rescaled)
-        return [sentence_of("verdict:urdf", joints=listed(worse))] if worse else []
+        by_link = ((x, [j for j in worse if (j in self.pinned) is x]) for x in (False, True))
+        return [sentence_of("verdict:urdf", joints=listed(j), pinned=x) for x, j in by_link if j]
 
     def at_rest(self) -> list[str]:
         """Return the joints at rest in all recordings, and those at rest in all validation logs."""
@@ -264,21 +265,16 @@ def uses_line(uses: Mapping[str, str]) -> str:
 
 def _predicted(joints: Mapping[str, str]) -> str:
     """Return whether the predictions of joints can be used."""
-    statuses = set(joints.values())
-    if statuses <= {"not evaluated"}:
-        return _NOT_VERIFIED
-    if statuses <= {"not evaluated", "poor"}:
-        return "no, the errors on validation logs are large"
-    if "poor" in statuses:
-        return f"yes, without {_named(joints, 'poor')}"
-    if "not evaluated" in statuses:
-        return f"yes, without {_named(joints, 'not evaluated')} (not evaluated)"
-    return "yes, with the warnings" if "usable" in statuses else "yes"
-
-
-def _named(joints: Mapping[str, str], status: str) -> str:
-    """Return the joints with a status, as part of a sentence."""
-    return listed([joint for joint, verdict in joints.items() if verdict == status], NAMED)
+    poor = [joint for joint, status in joints.items() if status == "poor"]
+    untested = [joint for joint, status in joints.items() if status == "not evaluated"]
+    passed = [joint for joint in joints if joint not in (*poor, *untested)]
+    if not passed:
+        return "no, the errors on validation logs are large" if poor else _NOT_VERIFIED
+    if len(passed) < len(poor):
+        return f"yes, for {listed(passed, NAMED)} only"
+    if poor or untested:
+        return f"yes, without {listed(poor or untested, NAMED)}{' (not evaluated)' * (not poor)}"
+    return "yes, with the warnings" if "usable" in joints.values() else "yes"
 
 
 def _with(use: str, condition: str) -> str:
@@ -438,11 +434,9 @@ def check_ignored(ignore: Sequence[str]) -> None:
     for code in ignore:
         require_kind(code, str, "a code in ignore", "the code of a finding")
         if code not in known:
-            near = difflib.get_close_matches(code, known, n=1)
-            hint = f". Did you mean {near[0]!r}?" if near else ""
             raise SettingsError(
                 f"doctor: ignore has the code {code!r}, which is unknown or changes no verdict; "
-                f"expected: {listed(known)}{hint}"
+                f"expected: {listed(known)}{suggestion(code, known)}"
             )
 
 

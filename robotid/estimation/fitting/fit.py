@@ -170,6 +170,12 @@ def pinned_links(bounds: ConstraintSettings, model: RobotModel) -> tuple[str, ..
     return (*bounds.pinned, *(x for x in negligible_bodies(model) if x not in bounded))
 
 
+def pinned_joints(bounds: ConstraintSettings, model: RobotModel) -> tuple[str, ...]:
+    """Return the joints whose own links keep the prior's values."""
+    links = pinned_links(bounds, model)
+    return tuple(joint.name for joint in model.tree.movable if joint.child in links)
+
+
 def make_constraints(bounds: ConstraintSettings, extent: Mapping[str, Array]) -> Constraints:
     """Return the constraints in the form that the estimator needs."""
     A, com, extents = np.vstack([np.eye(3), -np.eye(3)]), {}, dict(extent)

@@ -173,7 +173,7 @@ def export(result: Result, target: Path) -> Written:
     exported = Exported.of(result, DYNAMICS_TERMS)
     sidecar = write_urdf(*result.identified, target, dynamics=exported.projection)
     unstated = unstated_terms(exported.model, exported.pi, "URDF", DYNAMICS_TERMS)
-    return exported.written(target, sidecar, notes=[*exported.notes, *unstated])
+    return exported.written(target, sidecar, notes=[*unstated, *exported.notes])
 
 
 def head_of(name: str, **values: object) -> str:

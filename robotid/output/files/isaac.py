@@ -39,7 +39,7 @@ def export(result: Result, target: Path, *, step: float = 0.005) -> Written:
     """Write the drives of a result as the YAML of Isaac Lab's actuators."""
     of = Exported.of(result, _TERMS)
     content = isaac_actuators(of.model, of.commanded, step)
-    notes = [*of.notes, *unstated_terms(of.model, of.pi, "Isaac Lab", _TERMS)]
+    notes = unstated_terms(of.model, of.pi, "Isaac Lab", _TERMS)
     for key, words, remedy in (
         ("offset", "the torque offset", "subtract it from the effort target"),
         ("zero", "the encoder's zero", "the simulator's position is the encoder's plus the zero"),
@@ -48,8 +48,8 @@ def export(result: Result, target: Path, *, step: float = 0.005) -> Written:
         if values:
             notes.append(f"Isaac Lab lacks {words} ({listed(values)}); {remedy}")
     head = head_of("isaac", robot=json.dumps(of.model.name), version=__version__, file=target.name)
-    write_text(yaml_text(content, "\n".join([head, *notes])), target)
-    return of.written(target, notes=notes)
+    write_text(yaml_text(content, "\n".join([head, *notes, *of.notes])), target)
+    return of.written(target, notes=[*notes, *of.notes])
 
 
 def isaac_actuators(

@@ -34,10 +34,10 @@ _COLUMNS = (
     ("joint", "code", "joint"), ("at [s]", ".2f", "time"), ("value of limit", ".4g", "limit"),
     ("unit", "text", "unit"),
 )  # fmt: skip
-_UNCHECKED = {
-    "unread": "Not checked, because no shape of these links can be read",
-    "left_alone": "Not checked, because these links touch by design",
-    "built_near": "Close by design, with half of their median distance as clearance",
+UNCHECKED = {
+    "unread": "not checked, because no shape of these links can be read",
+    "left_alone": "not checked, because these links touch by design",
+    "built_near": "close by design, with half of their median distance as clearance",
 }
 _NAMED = 5  # base parameters with the largest expected standard errors that are named
 _SHARP = 0.1  # share of the plausible range below which one is well determined ...
@@ -61,17 +61,23 @@ def write_motion_page(
     return write_text(page(title, _head(model, content), sections), target)
 
 
-def _head(model: RobotModel, content: Mapping[str, Any]) -> str:
+def search_figures(content: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the condition number of a motion and the computing time of its design, as text."""
     condition, how = content["condition_number"], f"{content['seconds']:.1f} s"
     if content["starts"]:
-        settled = "converged" if content["converged"] else "not converged: allow more seconds"
+        settled = "converged" if content["converged"] else "not converged: increase --seconds"
         how += f", {content['starts']} start{'s' * (content['starts'] != 1)}, {settled}"
-    columns = "(regressor, columns in units of the prior)"
+    number = "infinite" if condition is None else f"{condition:.0f}"
+    return f"{number} (regressor, columns in units of the prior)", how
+
+
+def _head(model: RobotModel, content: Mapping[str, Any]) -> str:
+    condition, how = search_figures(content)
     facts = {
         "motion": f"{content['kind']}, {content['duration']:.4g} s",
         "joints": f"{len(model.joints)}",
         "criterion": content["criterion"],
-        "condition number": "infinite" if condition is None else f"{condition:,.0f} {columns}",
+        "condition number": condition,
         "computing time": how,
     }
     html = facts_html({name: escape(value) for name, value in facts.items()})
@@ -108,8 +114,8 @@ def _collisions(content: Mapping[str, Any], course: Course) -> str:
     elif contact is not None:
         where = f"{contact.first} and {contact.second}"
         html = _nearest(where, contact.distance, contact.time, contact.required)
-    for key, words in _UNCHECKED.items():
-        html += f"<p>{words}: {escape(listed(entry[key]))}.</p>\n" if entry[key] else ""
+    for key, words in ((key, words) for key, words in UNCHECKED.items() if entry[key]):
+        html += f"<p>{words.capitalize()}: {escape(listed(entry[key]))}.</p>\n"
     return html
 
 

@@ -19,6 +19,7 @@ from robotid.diagnosis.catalogue import entries as catalogue_entries
 from robotid.diagnosis.catalogue import step_of
 from robotid.diagnosis.residual.misfit import setting_of, with_entries
 from robotid.diagnosis.verdict.verdict import GOOD, is_beaten
+from robotid.estimation.fitting.fit import pinned_joints
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.output.files.exports import formats
 from robotid.robot.drive_term import DriveTerm
@@ -99,8 +100,7 @@ def _key(flag: str, value: str) -> tuple[str, str]:
 
 @cache
 def _texts() -> Mapping[str, Mapping[str, Any]]:
-    path = Path(__file__).parent / "steps.toml"
-    return tomllib.loads(path.read_text(encoding="utf-8"))
+    return tomllib.loads((Path(__file__).parent / "steps.toml").read_text(encoding="utf-8"))
 
 
 def _step(
@@ -168,8 +168,7 @@ def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
 
 def _steps_of_motion(found: Identification, origin: Origin) -> tuple[Step, ...]:
     """Return the uses of a result that predicts positions; of a poor one, what to correct."""
-    replay = _replay(found, origin)
-    verdict = found.verdict
+    replay, verdict = _replay(found, origin), found.verdict
     if verdict.status != "poor":
         play = _step("play_commands" if found.has_gains else "play_torques", origin, replay)
         exports = exports_of(found.model.name, origin, has_gains=found.has_gains)
@@ -199,7 +198,8 @@ def _of_verdict(found: TorqueIdentification) -> list[Cause]:
     causes, predictions = [], found.predictions
     measured = [(j, m) for metrics in predictions.values() for j, m in metrics.per_joint.items()]
     rescaled = {joint for f in found.findings if f.code == "log_differs" for joint in f.joints}
-    beaten = {joint for joint, m in measured if is_beaten(m)} - rescaled
+    settled = rescaled.union(pinned_joints(found.estimator.bounds, found.model))
+    beaten = {joint for joint, m in measured if is_beaten(m)} - settled
     poor = {j for j, m in measured if m.relative_error_pct and m.relative_error_pct > GOOD}
     for code, joints in (("beaten", beaten), ("poor_prediction", poor)):
         if joints:
@@ -234,35 +234,29 @@ def _scale(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause])
     masses = f"{after:.4g} kg {source}, {before:.4g} kg {origin_of}"
     if payloads := found.scale_check.payloads:
         payload = next((x for x in payloads if x.contradicts), payloads[0])
-        gains = _gain_flags(origin) if payload.contradicts else []
-        flags = [x for joint, _ in gains for x in ("--gain", f"{joint}=GAIN")]
+        stated = [value for flag, value in pairwise(origin.source) if flag == "--gain"]
+        gains = [value.partition("=")[0] for value in stated] if payload.contradicts else []
+        flags = [x for joint in gains for x in ("--gain", f"{joint}=GAIN")]
         again = (origin.again(*flags),) if origin.source else ()
-        action = "Correct" if payload.contradicts else "Verify"
         return _step(
             "wrong_gains" if gains else "stated_payload", origin,
-            (*_payload_gains(found, payload), *again), check=check, action=action,
-            message=payload.message,
+            (*_payload_gains(found, origin, payload), *again), check=check,
+            message=payload.message, action="Correct" if payload.contradicts else "Verify",
         )  # fmt: skip
     if found.scale_check.is_total_determined:
         return _step("known_mass", origin, check=check, masses=masses)
-    return _step("known_payload", origin, _payload_gains(found), check=check, masses=masses)
+    return _step("known_payload", origin, _payload_gains(found, origin), check=check, masses=masses)
 
 
-def _gain_flags(origin: Origin) -> list[tuple[str, str]]:
-    stated = [value for flag, value in pairwise(origin.source) if flag == "--gain"]
-    return [(joint, value) for joint, _, value in (text.partition("=") for text in stated)]
-
-
-def _payload_gains(found: TorqueIdentification, payload: PayloadCheck | None = None) -> list[str]:
+def _payload_gains(
+    found: TorqueIdentification, origin: Origin, payload: PayloadCheck | None = None
+) -> tuple[str, ...]:
     """Return the command that identifies the gains of currents; nothing without files."""
-    urdf, log = str(found.model.tree.path), str(found.fitted[0].recording.log.path)
-    if not log:
-        return []
     loaded, mass, link = _LOADED, "KG", []
     if payload is not None:
         loaded, mass, link = payload.log, f"{payload.known:g}", ["--link", payload.link]
-    flags = ("--reference", log, *link, "--mass", mass, "--gains")
-    return [shlex.join(["robotid", "payload", urdf, loaded, *flags])]
+    flags = ("--reference", origin.folder, *link, "--mass", mass, "--gains")
+    return origin.using("payload", str(found.model.tree.path), loaded, *flags)
 
 
 def _gains(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
@@ -270,7 +264,7 @@ def _gains(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause])
     findings = [f for cause in causes for f in cause.findings if f.code == "current_for_torque"]
     factors = [f"{f.evidence['factor']:.3g} x" for f in findings if "factor" in f.evidence]
     return _step(
-        "gains", origin, _payload_gains(found), joints or {"JOINT": "GAIN"},
+        "gains", origin, _payload_gains(found, origin), joints or {"JOINT": "GAIN"},
         joints=listed(joints or ["the joints"], NAMED),
         scales=f" ({listed(factors, NAMED)})" if factors else "",
     )  # fmt: skip

@@ -35,7 +35,7 @@ from robotid.data.signal_settings import LogSource
 
 JOINTS = ("shoulder", "elbow")
 STATE = "sensor_msgs/msg/JointState"
-HOW = "(job file table [log], CLI --topic, Python source=LogSource(topic=...))"
+HOW = "(job file table [log], CLI --topic)"
 
 
 def make_log(**changes):

@@ -39,7 +39,7 @@ from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource, LogUnits
 
 JOINTS = ("shoulder", "elbow")
-HOW = "(job file table [log], CLI --topic, Python source=LogSource(topic=...))"
+HOW = "(job file table [log], CLI --topic)"
 WRITTEN = [".csv", ".parquet", ".npz", ".h5", ".hdf5", ".mat"]
 
 
@@ -648,7 +648,7 @@ BROKEN = [
                       q=dict(shape=(10**12, 1), chunks=(1024, 1))), r"the shape \(1000000000000,"),
     (".h5", hdf5_with(time=T, q=T[:, None], tau=T[:, None], joints=np.array([b"\xff\xfe"])),
      "a name in joints is not UTF-8 text"),
-    (".h5", hdf5_with(time="now", q="here", tau_a=["x"] * 20), "has no column 'time'"),
+    (".h5", hdf5_with(time="now", q="here", tau_a=["x"] * 20), "no columns 'time', 'q_a', "),
     (".parquet", lambda path: path.write_bytes(b"PAR1 not really"), r"file \(ArrowInvalid: Parq"),
 ]  # fmt: skip
 

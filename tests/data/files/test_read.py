@@ -178,7 +178,11 @@ REFUSED = {
                       '# tau_elbow = "NAME"$'),
     "misspelt": (dict(q_elbow=None, q_elbow2=ONE), {}, '\nq_elbow = "q_elbow2"  # by order$'),
     "no time": (dict(time=None, Clock=T), {}, "log has no column 'time'; columns found: q_shoulder"
-                ", q_elbow, tau_shoulder, tau_elbow, Clock. Rename it", "the rate of the rows [Hz"),
+                ", q_elbow, tau_shoulder, tau_elbow. Other columns: Clock. Without time stamps, gi",
+                "the rate of the rows [Hz", '\n[columns]\nq_shoulder = "', '\n# time = "NAME"$'),
+    "units in names": (dict(time=None, stamp_ms=T, q_elbow=None, q_elbow_deg=ONE), {}, "no column "
+                       "'time'; columns", '\n[columns]\ntime = "stamp_ms"\n', 'w = "q_elbow_deg"\n',
+                       '"\n[units]  # by the names\ntime = "ms"\nangle = "deg"$'),
     "no standard name": ({}, dict(columns={"tau_elbw": "tau_elbow"}), "columns: 'tau_elbw' is not a"
                          " standard name of a column, as 'time' or 'tau_shoulder'. Did you mean"),
     "no such column": ({}, dict(columns={"tau_elbow": "tau_elbo"}), "log has no column 'tau_elbo', "

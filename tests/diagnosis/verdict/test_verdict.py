@@ -283,8 +283,7 @@ def test_drive_parameters_that_the_prior_determines_are_named_and_change_no_verd
         more = Determined(undetermined, is_poorly_excited=False, uncertain_drives=["a.coulomb"])
         assert more.warnings() == []
         assert "a.coulomb: the standard error is as large as the prior's" in more.notes()[-1]
-        plain = Determined(undetermined, is_poorly_excited=False).notes()
-        assert more.notes()[:-1] == plain
+        assert more.notes()[:-1] == Determined(undetermined, is_poorly_excited=False).notes()
 
 
 def test_errors_of_the_wrench_on_the_base_are_noted_beside_those_of_joints():
@@ -309,6 +308,9 @@ def test_joints_better_by_the_urdf_are_those_of_all_logs():
     (reason,) = found.better_by_urdf({"a"})  # bodies are not blamed for another gain
     assert reason.startswith("the URDF with fitted drives predicts b better than")
     assert found.better_by_urdf({"a", "b"}) == []
+    one, other = replace(found, pinned=("b",)).better_by_urdf()
+    assert "predicts a better than the identified bodies: keep the URDF's values for" in one
+    assert "predicts b better than the identified bodies. The links of these joints keep" in other
     assert found.at_rest() == [
         "the joints e do not move in any recording: not evaluated",
         "the joints d do not move in any validation log: not evaluated",
@@ -352,6 +354,8 @@ def uses(*statuses, scale_check=VERIFIED, **changes):
         (("poor",) * 3, VERIFIED, {},
          ("no, the errors on validation logs are large", "no, torques of a, b, c are poor",
           "no, the errors on validation logs are large")),
+        (("poor", "good", "poor"), VERIFIED, {},
+         ("yes, for b only", "no, torques of a, c are poor", "yes, without a")),
         (("not evaluated",) * 3, VERIFIED, {}, ("not verified, no validation log",) * 3),
         (("good",) * 3, VERIFIED, {"is_consistent": False},
          ("yes", "no, not physically consistent", "yes")),

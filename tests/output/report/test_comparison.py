@@ -197,5 +197,4 @@ def test_a_status_of_another_program_is_refused_and_escaped(marked, tmp_path):
     with pytest.raises(DataError, match=r"verdict.status is .*, expected one of good, usable"):
         read_result(path)
     shown = {"label": "A", "name": "", "path": "", "estimator": "", "verdict": result["verdict"]}
-    text = page("", comparison._verdict(shown), {})
-    assert "<script>alert" not in text
+    assert "<script>alert" not in page("", comparison._verdict(shown), {})
