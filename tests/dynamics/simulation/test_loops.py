@@ -20,28 +20,18 @@ from robotid.dynamics.simulation.loops import (
     why_no_solution,
 )
 from robotid.robot import drives
-from robotid.robot.drives import (
-    Coulomb,
-    Lag,
-    LoadFriction,
-    LuGre,
-    Offset,
-    PositionCoulomb,
-    Presliding,
-    Stribeck,
-    Viscous,
-)
+from robotid.robot.drives import Coulomb, LoadFriction, Viscous
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
 
 RATE = 500.0  # [Hz]
 LEGS = (*LEG, *(name.replace("FL", "FR") for name in LEG))
-PLAIN = (Viscous(), Coulomb(), Offset())
+PLAIN = (Viscous(), Coulomb(), drives.Offset())
 #: Every term that a roll-out has, the load of the gear last.
 TERMS = (
-    *PLAIN, PositionCoulomb(order=1, centre=0.1), PositionCoulomb(order=2, centre=0.1),
-    Stribeck(speed=0.2), drives.Asymmetric(), drives.Cubic(), drives.Tanh(speed=0.3),
+    *PLAIN, *(drives.PositionCoulomb(order=order, centre=0.1) for order in (1, 2)),
+    drives.Stribeck(speed=0.2), drives.Asymmetric(), drives.Cubic(), drives.Tanh(speed=0.3),
     drives.Harmonic(order=3), drives.Harmonic(order=2, is_sine=True), drives.Power(exponent=1.3),
     drives.Ramp(low=0.1, high=0.9), drives.Spring(), drives.Hat(at=0.1, before=-0.3, after=0.4),
     drives.Counterbalance(arm=0.5, base=1.2, angle=0.2, rest=0.3), LoadFriction(),
@@ -51,8 +41,8 @@ VALUES = (
 )  # fmt: skip
 #: Terms with a memory, among others.
 LASTING = (
-    Viscous(), Coulomb(), Presliding(displacement=0.01),
-    LuGre(displacement=0.02, speed=0.3, excess=0.5), LoadFriction(),
+    Viscous(), Coulomb(), drives.Presliding(displacement=0.01),
+    drives.LuGre(displacement=0.02, speed=0.3, excess=0.5), LoadFriction(),
 )  # fmt: skip
 
 
@@ -123,7 +113,7 @@ def integrated(model, loops, log, friction, share=0.0):
 
 def test_an_arm_moves_as_a_stiff_integration_of_pinocchio_says(ur5):
     log = commanded(ur5, 0.16)
-    terms = (*PLAIN, PositionCoulomb(order=2, centre=0.1), Stribeck(speed=0.2))
+    terms = (*PLAIN, drives.PositionCoulomb(order=2, centre=0.1), drives.Stribeck(speed=0.2))
     loops = loops_of(ur5, terms, (2.0, 3.0, 0.5, 4.0, 1.0), kp=500.0, limit=np.full(6, 60.0))
 
     def friction(q, v):
@@ -168,7 +158,8 @@ def test_a_gear_loses_a_share_of_its_load(planar):
 
 
 @pytest.mark.parametrize(
-    "term", [Presliding(displacement=0.01), LuGre(displacement=0.01, speed=0.2, excess=0.6)]
+    "term",
+    [drives.Presliding(displacement=0.01), drives.LuGre(displacement=0.01, speed=0.2, excess=0.6)],
 )
 @pytest.mark.parametrize("rate", [None, 100.0])
 def test_friction_is_taken_up_as_its_equation_says(tmp_path, term, rate):
@@ -436,7 +427,7 @@ def test_robots_and_terms_that_cannot_be_rolled_out_are_named(planar):
     ):
         with pytest.raises(kind, match=words):
             ClosedLoopRobot(RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), **options))
-    loops = loops_of(planar, (*PLAIN, Lag()), (0.1, 0.1, 0.0, 0.01))
+    loops = loops_of(planar, (*PLAIN, drives.Lag()), (0.1, 0.1, 0.0, 0.01))
     words = r"the term Lag is not possible in a closed-loop simulation: it delays.*set delay in"
     with pytest.raises(SettingsError, match=words):
         rolled(planar, loops, commanded(planar))
@@ -447,7 +438,7 @@ def test_robots_and_terms_that_cannot_be_rolled_out_are_named(planar):
     [
         (Coulomb(), -5.0, r"simulation of FL_hip_joint .*joint.coulomb is -5, expected 0 or more"),
         (LoadFriction(), 1.4, r"FL_hip_joint.load is 1.4, expected at most 0.5. Set other"),
-        (PositionCoulomb(order=1, centre=0.9), 3.0,
+        (drives.PositionCoulomb(order=1, centre=0.9), 3.0,
          r"FL_hip_joint .* its Coulomb friction is -3.11 N m at -0.136 rad, expected 0 or more"),
     ],
 )  # fmt: skip
@@ -473,8 +464,8 @@ def test_friction_that_falls_faster_than_inertia_allows_slips_as_in_small_steps(
     ramp = 0.05 * t[:, None]
     log = Log(t, 0 * ramp, 0 * ramp, ("j",), q_ref=ramp, has_torque=False)
     loops = loops_of(
-        model, (Viscous(), Coulomb(), Stribeck(speed=0.03)), (0.5, 0.05, 0.3), zero=np.zeros(1),
-        armature=np.zeros(1), kd=np.zeros(1), kp=50.0,
+        model, (Viscous(), Coulomb(), drives.Stribeck(speed=0.03)), (0.5, 0.05, 0.3),
+        zero=np.zeros(1), armature=np.zeros(1), kd=np.zeros(1), kp=50.0,
     )  # fmt: skip
     light = replace(loops, bodies=1e-3 * loops.bodies)
     coarse, fine = (rolled(model, light, log, step=step).q[:, 0] for step in (2e-3, 1e-5))
