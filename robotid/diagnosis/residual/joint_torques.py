@@ -289,11 +289,8 @@ def _beyond_torque(evaluations: Sequence[Evaluation]) -> tuple[float, Array]:
     both = (both - both.mean(axis=1, keepdims=True)) * np.hanning(len(k))[:, None]
     powers, f = np.abs(np.fft.rfft(both, axis=1)) ** 2, np.fft.rfftfreq(len(k), 1 / motion.rate)
     above = np.cumsum(powers[:, f < cutoff][:, ::-1], axis=1)[:, ::-1]  # each frequency
-    excess, share = (
-        above[1] - above[0] / decisions.BETTER,
-        above[1] / np.maximum(above[1, 0], decisions.NOTHING),
-    )
-    share[excess <= 0] = 0.0
+    excess = above[1] - above[0] / decisions.BETTER
+    share = np.where(excess > 0, above[1] / np.maximum(above[1, 0], decisions.NOTHING), 0.0)
     best = np.argmax(excess, axis=0)
     counts = np.take_along_axis(share, best[None], 0)[0] >= decisions.MISFIT_WARNS
     first = int(best[counts].max(initial=0))

@@ -304,18 +304,11 @@ def test_a_cutoff_is_advised_above_which_the_torque_lacks_what_is_predicted(rng)
     r = np.column_stack([0.2 * slow - 0.3 * quick, noise, 0 * t])
     segment = np.repeat([0, 1], [600, 2400])
     r[:600] = tau[:600]  # the shorter segment is not examined
-    evaluations = [
-        SimpleNamespace(
-            recording=SimpleNamespace(
-                trajectory=SimpleNamespace(
-                    t=t[:rows], tau=tau[:rows], segment=segment[:rows], rate=100.0
-                ),
-                signals=SignalSettings(cutoff=8.0),
-            ),
-            torques={"estimate": (tau - r)[:rows]},
-        )
-        for rows in (900, 3000)
-    ]  # fmt: skip
+    evaluations = []
+    for k in (slice(900), slice(3000)):
+        motion = SimpleNamespace(t=t[k], tau=tau[k], segment=segment[k], rate=100.0)
+        recording = SimpleNamespace(trajectory=motion, signals=SignalSettings(cutoff=8.0))
+        evaluations.append(SimpleNamespace(recording=recording, torques={"estimate": (tau - r)[k]}))
     frequency, share = _beyond_torque(evaluations)
     assert 0.6 < frequency < 5.0
     np.testing.assert_allclose(share, [0.3**2 / (0.2**2 + 0.3**2), 0.0, 0.0], atol=0.01)
