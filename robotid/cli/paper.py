@@ -9,8 +9,7 @@ from robotid.cli.job import add_out, add_shown
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
     add_out(parser, "robotid-paper")
-    words = "few iterations and motions, as a trial"
-    parser.add_argument("--quick", action="store_true", help=words)
+    parser.add_argument("--quick", action="store_true", help="few iterations and motions: a trial")
     add_shown(parser, "progress", json="print paper.json")
 
 
@@ -21,8 +20,9 @@ def run(options: argparse.Namespace) -> None:
     few = PaperSettings(iterations=5, longest=5, runs=5, patience=5)
     with progress_of(options) as progress:
         result = run_paper(options.out, settings=few if options.quick else None, progress=progress)
-    files = ("paper.html", "paper.json", "replay.html")
-    show_found(result, options, _show, files, options.out)
+    if options.quick and not options.json:
+        print("a trial: too few iterations and motions to converge\n")
+    show_found(result, options, _show, ("paper.html", "paper.json", "replay.html"), options.out)
 
 
 def _show(result: dict[str, Any]) -> None:
