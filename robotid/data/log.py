@@ -106,6 +106,7 @@ class Log:
                 "zeros"
             )
         factors, shape = real_numbers(self.gain_factors, "gain_factors"), (2, len(self.joints))
+        factors = factors if (factors != 1.0).any() else np.ones((2, 1))  # of any number of joints
         if factors.shape not in ((2, 1), shape) or not (factors > 0.0).all():
             raise DataError(f"{where}: gain_factors is not positive, of shape {shape}: {factors}")
         object.__setattr__(self, "gain_factors", frozen(np.broadcast_to(factors, shape)))
