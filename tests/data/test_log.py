@@ -78,6 +78,7 @@ FAULTS = [
     (dict(t=T[:1], **{x: getattr(LOG, x)[:1] for x in ("q", "v", "a", "tau")}), "run3.csv has 1 "
      "rows, expected at least 2; record longer"),
     (dict(joints=("elbow", "elbow")), "joints contains elbow twice; name each joint once"),
+    (dict(gain_factors=[[1.0, 2.0], [0.0, 1.0]]), "gain_factors is not positive, of shape (2, 2)"),
     (dict(joints="ab"), "joints is 'ab', expected at least one name in a tuple"),
     (dict(joints=()), "joints is (), expected at least one name in a tuple"),
     (dict(has_torque=False), "has_torque is False, but tau is not 0; leave has_torque out, or"),
@@ -133,6 +134,7 @@ def test_windows_selections_and_signs_are_of_all_signals(rng):
     log = Log(
         t, **dict(zip(names, arrays, strict=True)), joints=("a", "b", "c"),
         contacts={"foot": t > 3.25, "hand": t < 3.15}, wrenches={"fz foot": t**2},
+        gain_factors=[[1.0, 2.0, 3.0], [1.0, 1.0, 0.5]],
     )  # fmt: skip
     part, some = log.window(3.1, 3.4), log.select(["c", "a"])
     turned = log.turned(np.array([1.0, -1.0, -1.0]))
@@ -144,6 +146,8 @@ def test_windows_selections_and_signs_are_of_all_signals(rng):
     assert part.contacts["hand"].tolist() == [True, False, False, False]
     np.testing.assert_array_equal(part.wrenches["fz foot"], t[1:5] ** 2)
     assert some.joints == ("c", "a")
+    assert some.gain_factors.tolist() == [[3.0, 1.0], [0.5, 1.0]]
+    assert part.gain_factors.tolist() == [[1.0, 2.0, 3.0], [1.0, 1.0, 0.5]]
 
 
 def test_some_samples_of_a_trajectory_cannot_be_changed_either_and_keep_nothing_of_the_whole():
