@@ -9,6 +9,7 @@ from dataclasses import MISSING
 from pathlib import Path
 from string import Formatter
 
+from robotid.base.settings import Settings
 from robotid.cli.job import Job, LogEntry, PayloadEntry
 from robotid.data.signal_settings import (
     BaseSource,
@@ -363,7 +364,7 @@ def default_of(field):
     words = {True: "true", False: "false"} if isinstance(value, bool) else {}
     if isinstance(value, str):
         return f'`"{value}"`'
-    if isinstance(value, LogGains):
+    if isinstance(value, Settings):
         return "-"
     if isinstance(value, tuple):
         return f"`{list(value)}`"

@@ -96,9 +96,8 @@ def test_the_page_of_the_job_file_is_what_the_settings_say(tmp_path):
         assert (DOCS / "reference" / name).read_text() == text, "run python docs/write_reference.py"
     page = "".join(text for name, text in written.items() if name.startswith("job_"))
     for key in Job.paths().keys() - {"model"}:
-        assert f"| `{key.rpartition('.')[2]}` |" in page or key.startswith(
-            ("ident", "valid", "transm", "payload_check", "coupling", "contact", "loop")
-        )
+        expected = ("ident", "valid", "transm", "payload_check", "coupling", "contact", "loop")
+        assert f"| `{key.rpartition('.')[2]}` |" in page or key.startswith(expected)
     pages = [examples_of(f"reference/{name}") for name in written]
     (table,) = [table for tables in pages for table in tables]
     job = job_from_settings(table, "job_file.md", tmp_path)

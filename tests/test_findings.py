@@ -156,9 +156,8 @@ def test_a_finding_has_its_subject_its_figures_and_its_sentence():
         "a.csv: the torque leads the position by 2.1 +- 1.0 ms, which is not significant; no "
         "action needed"
     )
-    assert reason_of(slow) == (
-        "the torque is delayed by -0.002 s relative to the position (negative: early)"
-    )
+    wanted = "the torque is delayed by -0.002 s relative to the position (negative: early)"
+    assert reason_of(slow) == wanted
 
 
 def test_of_several_numbers_a_sentence_has_the_range_or_the_one_that_its_slot_asks_for():

@@ -108,7 +108,8 @@ class Log:
         factors, shape = real_numbers(self.gain_factors, "gain_factors"), (2, len(self.joints))
         factors = factors if (factors != 1.0).any() else np.ones((2, 1))  # of any number of joints
         if factors.shape not in ((2, 1), shape) or not (factors > 0.0).all():
-            raise DataError(f"{where}: gain_factors is not positive, of shape {shape}: {factors}")
+            stated = f"gain_factors is {factors.tolist()}, expected positive factors"
+            raise DataError(f"{where}: {stated} of shape {shape}: kp and kd of each joint")
         object.__setattr__(self, "gain_factors", frozen(np.broadcast_to(factors, shape)))
         if len(self.t) < 2:
             raise DataError(f"{where} has {len(self.t)} rows, expected at least 2; record longer")

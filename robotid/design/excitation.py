@@ -91,7 +91,10 @@ class MotionSettings(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.clearance is None and (self.boxes or self.floor is not None):
-            raise SettingsError("clearance is none, expected metres: a floor or a box is given")
+            raise SettingsError(
+                "clearance is none, expected metres: a floor or a box is given. Set a clearance, "
+                "or remove floor and boxes"
+            )
         for name in ("velocity", "torque", "acceleration", "jerk", "power", "noise"):
             for joint, value in getattr(self, name).items():
                 if not SIZE.holds(value):

@@ -19,9 +19,8 @@ PLAIN = ("--friction", "viscous+coulomb", "--no-report")
 
 def test_the_written_urdf_predicts_what_the_fit_predicts(arm_logs, tmp_path, capsys):
     fit, keep = (str(arm_logs / f"{name}.csv") for name in ("fit", "keep"))
-    assert (
-        main(["identify", ARM, fit, "--validate", keep, "--no-report", "--out", str(tmp_path)]) == 0
-    )
+    words = ["identify", ARM, fit, "--validate", keep, "--no-report", "--out", str(tmp_path)]
+    assert main(words) == 0
     result = json.loads((tmp_path / "result.json").read_text())
     capsys.readouterr()
     assert main(["validate", str(tmp_path / "result.json"), keep, "--json"]) == 0

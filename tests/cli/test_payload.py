@@ -112,17 +112,15 @@ def test_a_job_states_a_check_of_the_scale_in_its_result(files, tmp_path, ur5, c
     assert f"{other.message[0].upper()}{other.message[1:]}" in reason or other.message in reason
     whole = load_result(files / "out").content
     assert stated_scale_check(whole).payloads == (check, other)
-    assert job_from_settings(whole["settings"], "x", files).payload_checks == (
-        found.stated.job.payload_checks
-    )
+    wanted = found.stated.job.payload_checks
+    assert job_from_settings(whole["settings"], "x", files).payload_checks == wanted
     (step,) = [
         s for s in next_steps(found, Origin(("job.toml",), "out")) if "torque scale" in s.words
     ]
     assert step.words.startswith("Correct the torque scale: payload of 1.8 kg on tool0")
     urdf, loaded = found.model.tree.path, files / "loaded.csv"
-    assert step.blocks[0] == (
-        f"robotid payload {urdf} {loaded} --reference out --link tool0 --mass 1.8 --gains"
-    )
+    wanted = f"robotid payload {urdf} {loaded} --reference out --link tool0 --mass 1.8 --gains"
+    assert step.blocks[0] == wanted
     monkeypatch.chdir(files)
     assert main(shlex.split(step.blocks[0])[1:]) == 0
     assert "[torque.gains]\nshoulder_pan_joint = 1" in capsys.readouterr().out

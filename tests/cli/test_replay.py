@@ -240,9 +240,8 @@ def test_a_motion_without_torques_plays_and_marks_where_it_uses_the_most_of_limi
     assert marks["position"]["label"] == said
     assert q[round(100 * marks["position"]["t"])] == pytest.approx(q.max(), abs=1e-6)
     speed = np.abs(np.gradient(q, t))
-    assert (
-        f"{100 * speed.max() / elbow.velocity:.0f} % of its velocity" in marks["velocity"]["label"]
-    )
+    share = 100 * speed.max() / elbow.velocity
+    assert f"{share:.0f} % of its velocity" in marks["velocity"]["label"]
     assert marks["velocity"]["joint"] == "elbow_joint"
     assert speed[round(100 * marks["velocity"]["t"])] == pytest.approx(speed.max(), abs=1e-6)
     assert marks["torque"]["joint"] == "shoulder_lift_joint"  # which carries the arm

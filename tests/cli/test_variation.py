@@ -69,9 +69,8 @@ def test_result_has_the_variation_of_each_drive_parameter(result, folder):
         each.prediction.mean, each.prediction.std_error, each.prediction.spread
     )  # fmt: skip
     assert entry["std_error_by_log"] == each.std_errors.tolist()
-    assert entry["one_more"] == dict(
-        zip(("std_error", "interval_width"), each.prediction.after, strict=True)
-    )
+    wanted = dict(zip(("std_error", "interval_width"), each.prediction.after, strict=True))
+    assert entry["one_more"] == wanted
     middle = each.prediction.mixture.quantiles(np.full(1, 0.5))[0]
     assert entry["next_quantiles"][7] == pytest.approx(middle)
     low, high = np.interp([-1.96, 1.96], SCORES, entry["next_quantiles"])

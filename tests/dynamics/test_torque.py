@@ -70,9 +70,8 @@ def test_drives_of_a_transmission_are_what_its_motors_take(ur5, rng):
     pi = model.standard_parameters()
     # inertia and viscous friction are seen through the square of the gear ratio
     pi[-8:] = (own * gear[:, None] ** [2, 2, 1, 1]).ravel()
-    assert model.layout.names[-8:] == tuple(
-        f"{joint}.{term}" for joint in ur5.joints[4:] for term in model.layout.terms
-    )
+    wanted = tuple(f"{joint}.{term}" for joint in ur5.joints[4:] for term in model.layout.terms)
+    assert model.layout.names[-8:] == wanted
     q, v, a = states(model, rng, samples=5)
     w, dw = v[:, 4:] @ T.T, a[:, 4:] @ T.T
     tau_m = own[:, 0] * dw + own[:, 1] * w + own[:, 2] * np.sign(w) + own[:, 3]

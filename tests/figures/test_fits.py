@@ -113,9 +113,8 @@ def test_errors_are_shares_of_the_torque_that_the_robot_has(ran):
     for j, (joint, m) in enumerate(result["validation"][0]["per_joint"].items()):
         rows = used & fast[:, j]
         assert m["rows"] == pytest.approx(rows.sum(), rel=0.05)
-        assert 100 * m["rmse"] / m["relative_error_pct"] == pytest.approx(
-            rms(tau[rows, j]), rel=0.02
-        )
+        expected = rms(tau[rows, j])
+        assert 100 * m["rmse"] / m["relative_error_pct"] == pytest.approx(expected, rel=0.02)
         # what the estimate misses of the torque without noise is less than what it misses with it
         assert rms((predicted - tau)[rows, j]) < 1.1 * m["rmse"], joint
         assert m["unit"] == ("N" if joint == "reach" else "N m")

@@ -34,9 +34,8 @@ def test_a_design_uses_of_each_limit_what_its_file_shows(ran):
     used = {j: np.abs(motion[f"q_{j}"] - middle).max() / (0.7 * half)
             for j, middle, half in (RANGES)}  # fmt: skip
     assert 1 - margins["position"]["margin"] == pytest.approx(max(used.values()), abs=0.02)
-    assert 1 - margins["acceleration"]["margin"] == pytest.approx(
-        np.abs(motion["ddq_lift"]).max() / 3, abs=0.02
-    )
+    wanted = np.abs(motion["ddq_lift"]).max() / 3
+    assert 1 - margins["acceleration"]["margin"] == pytest.approx(wanted, abs=0.02)
 
 
 def test_a_preview_rests_on_the_noise_that_is_stated(ran):

@@ -88,12 +88,10 @@ def test_a_payload_on_a_link_that_is_fixed_to_a_moving_one_is_exact(ur5, rng):
     low, high = payload.mass_interval
     assert said[0].startswith("tool0: 2 +- ")
     assert said[0].endswith(f" kg, 95 %: [{low:.4g}, {high:.4g}]")
-    assert [float(x.split(" +-")[0]) for x in said[1].partition(": ")[2].split(", ")] == (
-        pytest.approx(COM, rel=1e-3)
-    )
-    assert [float(x.split(" +-")[0]) for x in said[2].partition(": ")[2].split(", ")] == (
-        pytest.approx(np.diag(INERTIA), rel=1e-3)
-    )
+    wanted = pytest.approx(COM, rel=1e-3)
+    assert [float(x.split(" +-")[0]) for x in said[1].partition(": ")[2].split(", ")] == wanted
+    wanted = pytest.approx(np.diag(INERTIA), rel=1e-3)
+    assert [float(x.split(" +-")[0]) for x in said[2].partition(": ")[2].split(", ")] == wanted
     assert repr(found).startswith("<PayloadFit of ur5: tool0 2 +- ")
 
 

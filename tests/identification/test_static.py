@@ -85,9 +85,8 @@ def test_gravity_is_found_with_true_intervals(name, kind, rng):
     assert np.sqrt(np.mean((given - wanted) ** 2, axis=0)).max() < near * size.max()
     assert found.is_consistent
     assert found.verdict.status in ("good", "usable")
-    assert found.verdict.reasons[-1].startswith(
-        "static model: gravity, offsets and Coulomb friction"
-    )
+    expected = "static model: gravity, offsets and Coulomb friction"
+    assert found.verdict.reasons[-1].startswith(expected)
     (note,) = [f for f in found.findings if f.code == "static"]
     count = note.evidence["samples"]
     assert count == 60 if kind == "poses" else count > 500

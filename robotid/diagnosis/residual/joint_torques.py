@@ -145,7 +145,7 @@ class JointTorque:
         name, where = ("", 0.0) if best is None else (best.name, best.where)
         sizes = [0.0] if best is None else np.abs(best.centres)
         is_slow = name == "speed" and abs(where) < float(np.median(sizes))
-        quick, frequency = self.broadband or 0.0, self.frequency
+        quick = self.broadband or 0.0
         kinds = {
             "unused": bool(np.isnan(rms["measured"])),
             "zero": rms["measured"] == 0,
@@ -163,7 +163,7 @@ class JointTorque:
             "residual:cause", what=kind, left=_percent(rms["residual"] / (rms["measured"] or 1.0)),
             share=_percent(share), name=name, unit=self.unit if best is None else best.unit,
             size=0.0 if best is None else best.means[0], low=is_slow, where=where,
-            frequency=frequency,
+            frequency=self.frequency,
             names=", ".join(d.name for d in self.follows if d.name != "constant"),
         )  # fmt: skip
         before = () if self.fitted is None else self.fitted.follows
@@ -172,7 +172,7 @@ class JointTorque:
             d.name == name and d.share is not None and not d.is_significant for d in before
         )
         what = "changed" if name and has_changed else name or kind
-        return cause, sentence_of("residual:advice", what=what, frequency=frequency)
+        return cause, sentence_of("residual:advice", what=what, frequency=self.frequency)
 
 
 def joint_torques(fit: Fit) -> tuple[JointTorque, ...]:
@@ -285,12 +285,14 @@ def _beyond_torque(evaluations: Sequence[Evaluation]) -> tuple[float, Array]:
     motion, cutoff = e.recording.trajectory, e.recording.signals.cutoff
     if cutoff is None or motion.rate is None:
         return np.inf, np.zeros(motion.tau.shape[1])
-    both = np.stack([motion.tau, motion.tau - e.torques["estimate"]])[:, k]
+    r = np.where(e.recording.mask, motion.tau - e.torques["estimate"], 0.0)
+    both = np.stack([motion.tau, r])[:, k]
     both = (both - both.mean(axis=1, keepdims=True)) * np.hanning(len(k))[:, None]
     powers, f = np.abs(np.fft.rfft(both, axis=1)) ** 2, np.fft.rfftfreq(len(k), 1 / motion.rate)
     above = np.cumsum(powers[:, f < cutoff][:, ::-1], axis=1)[:, ::-1]  # each frequency
     excess = above[1] - above[0] / decisions.BETTER
-    share = np.where(excess > 0, above[1] / np.maximum(above[1, 0], decisions.NOTHING), 0.0)
+    is_quick = (excess > 0) & (excess[0] <= 0)  # below it, the prediction is better than none
+    share = np.where(is_quick, above[1] / np.maximum(above[1, 0], decisions.NOTHING), 0.0)
     best = np.argmax(excess, axis=0)
     counts = np.take_along_axis(share, best[None], 0)[0] >= decisions.MISFIT_WARNS
     first = int(best[counts].max(initial=0))

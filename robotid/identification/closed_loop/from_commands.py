@@ -17,11 +17,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import unwrap
 from robotid.diagnosis.catalogue import codes_with, entries, finding
 from robotid.diagnosis.decisions import BETTER
-from robotid.diagnosis.verdict.fit_findings import (
-    correlated_sets,
-    not_written,
-    unlike_findings,
-)
+from robotid.diagnosis.verdict.fit_findings import correlated_sets, not_written, unlike_findings
 from robotid.diagnosis.verdict.verdict import (
     GOOD,
     GOOD_POSITION,

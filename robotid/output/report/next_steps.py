@@ -309,15 +309,14 @@ def _as_found(found: TorqueIdentification, origin: Origin, causes: Sequence[Caus
 def _watch(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     rows = found.metrics().per_joint
     where, advice = _named(causes, found.model.joints), dict[str, list[str]]()
-    for joint in dict.fromkeys(
-        joint for cause in causes for joint in cause.joints if joint in rows
-    ):
+    named = dict.fromkeys(joint for cause in causes for joint in cause.joints)
+    for joint in filter(rows.__contains__, named):
         advice.setdefault(found.residual_cause(joint)[1], []).append(joint)
     of = {text: f"{listed(joints)}: " for text, joints in advice.items() if len(advice) > 1}
-    why = " ".join(f"{of.get(text, '')}{text}." for text in advice if text)
+    why = "".join(f" {of.get(text, '')}{text}." for text in advice if text)
     if not any(joint in rows for joint in found.model.joints):  # no torques were measured
         where = "the base"
-        why = "Possible causes: noise of the motion (lower cutoff), an unmeasured force, a delay."
+        why = " Possible causes: noise of the motion (lower cutoff), an unmeasured force, a delay."
     return _step("watch", origin, _replay(found, origin), joints=where, why=why)
 
 

@@ -359,9 +359,8 @@ def test_normalised_positions_are_no_angles(tmp_path):
     with pytest.raises(DataError) as error:
         read_log(dataset(tmp_path), JOINTS, needs="commands")
     assert error.value.code == "angle_unit"
-    assert str(error.value).startswith(
-        "arm: LeRobot's files lack the unit of positions: degrees, or normalised positions"
-    )
+    wanted = "arm: LeRobot's files lack the unit of positions: degrees, or normalised positions"
+    assert str(error.value).startswith(wanted)
 
 
 MISSING, NAMELESS = object(), "no names of the motors in ac"

@@ -190,9 +190,8 @@ def test_a_command_that_the_drive_had_before_is_an_error(log, early):
         ("error", "log: joint_0"),
         ("error", "log: joint_1"),
     }
-    assert "before its command: the logged command is not the command of the drive" in (
-        errors[0].message
-    )
+    said = errors[0].message
+    assert "before its command: the logged command is not the command of the drive" in said
     assert errors[0].evidence["lag"] < -early / 2
 
 

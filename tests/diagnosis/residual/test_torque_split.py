@@ -152,9 +152,8 @@ def test_a_joint_is_judged_on_what_was_kept_apart(identified):
             torque.residual, (motion.tau - kept.torques["estimate"])[:, j], atol=1e-11
         )
         assert torque.rms["residual"] == pytest.approx(measured.rmse)
-        assert torque.rms["measured"] == pytest.approx(
-            measured.rmse * 100 / measured.relative_error_pct
-        )
+        expected = measured.rmse * 100 / measured.relative_error_pct
+        assert torque.rms["measured"] == pytest.approx(expected)
         np.testing.assert_allclose(
             sum(torque.parts.values()) + torque.residual, motion.tau[:, j], atol=1e-11
         )
@@ -300,18 +299,20 @@ def test_a_cutoff_is_advised_above_which_the_torque_lacks_what_is_predicted(rng)
     t = np.arange(3000) / 100.0
     slow, quick = np.sin(2 * np.pi * 0.6 * t), np.sin(2 * np.pi * 5.0 * t)
     noise = 0.3 * rng.standard_normal(len(t))
-    tau = np.column_stack([3 * slow, slow + noise, 0 * t])
-    r = np.column_stack([0.2 * slow - 0.3 * quick, noise, 0 * t])
+    tau = np.column_stack([3 * slow, slow + noise, 0 * t, slow])
+    r = np.column_stack([0.2 * slow - 0.3 * quick, noise, 0 * t, 2 * slow + 2 * quick])
     segment = np.repeat([0, 1], [600, 2400])
-    r[:600] = tau[:600]  # the shorter segment is not examined
+    r[:600] = tau[:600]  # the shorter segment is not examined, and no row that is not used
+    r[1000::97, 0] = 50.0
     evaluations = []
     for k in (slice(900), slice(3000)):
         motion = SimpleNamespace(t=t[k], tau=tau[k], segment=segment[k], rate=100.0)
-        recording = SimpleNamespace(trajectory=motion, signals=SignalSettings(cutoff=8.0))
+        signals, mask = SignalSettings(cutoff=8.0), np.abs(r[k]) < 10.0
+        recording = SimpleNamespace(trajectory=motion, signals=signals, mask=mask)
         evaluations.append(SimpleNamespace(recording=recording, torques={"estimate": (tau - r)[k]}))
     frequency, share = _beyond_torque(evaluations)
     assert 0.6 < frequency < 5.0
-    np.testing.assert_allclose(share, [0.3**2 / (0.2**2 + 0.3**2), 0.0, 0.0], atol=0.01)
+    np.testing.assert_allclose(share, [0.3**2 / (0.2**2 + 0.3**2), 0, 0, 0], atol=0.01)
     filtered = replace(torque(r[:, 0], slow, slow, slow), beyond=share[0], frequency=frequency)
     assert f"and 69 % of its power is above {frequency:.2g} Hz" in filtered.sentence
     assert f"Lower the cutoff in [signals], as far as {frequency:.2g} Hz" in filtered.sentence

@@ -226,9 +226,8 @@ def test_what_yourdfpy_cannot_read_is_a_finding(tmp_path):
     (finding,) = found(inspection, "yourdfpy_refuses")
     assert finding["severity"] == "warning"
     assert "ValueError" in finding["message"]
-    assert (
-        "limits, damping, friction and mimic of its joints were not checked" in finding["message"]
-    )
+    said = finding["message"]
+    assert "limits, damping, friction and mimic of its joints were not checked" in said
     assert inspection.structure is not None
     with pytest.raises(ModelError, match=r"yourdfpy cannot read two.urdf"):
         read_with_yourdfpy(tmp_path / "two.urdf")

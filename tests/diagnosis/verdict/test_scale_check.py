@@ -95,9 +95,8 @@ def test_a_load_without_mass_confirms_no_scale(factor, mass, contradicts):
     assert not scale_check.agrees
     assert scale_check.contradicts is contradicts
     assert "absolute scale not verified" in scale_check.message
-    assert (
-        f"gravity torque {factor:.2f} x the URDF's, total mass {mass:.4g} kg" in scale_check.message
-    )
+    said = scale_check.message
+    assert f"gravity torque {factor:.2f} x the URDF's, total mass {mass:.4g} kg" in said
     assert replace(scale_check, factor=1.05 - 1e-9, masses=(20.0, 20.8, 0.0)).agrees
     assert replace(scale_check, factor=1.05 + 1e-9, masses=(20.0, 20.8, 0.7)).agrees
 
@@ -217,9 +216,8 @@ def test_it_decides_before_the_urdf_and_a_contradiction_before_all():
     assert not urdf.agrees
     verified = replace(urdf, payloads=(SHARP,))
     assert verified.agrees
-    assert verified.message == (
-        f"absolute scale verified by a payload of known mass: {SHARP.message}"
-    )
+    expected = f"absolute scale verified by a payload of known mass: {SHARP.message}"
+    assert verified.message == expected
     wrong = replace(SHARP, identified=2.4, interval=(2.3, 2.5))
     like = ScaleCheck(scale=1.0, factor=1.0, masses=(20.0, 20.0, 0.0), payloads=(wrong,))
     assert like.contradicts

@@ -99,9 +99,8 @@ def test_each_joint_has_a_verdict_of_its_own():
         "a": "good", "b": "usable", "c": "poor", "d": "not evaluated",
     }  # fmt: skip
     assert found["a"].reasons[0].startswith("error at most 4.0 %")
-    assert (
-        found["c"].reasons[0].startswith("c: worse than a constant torque on val.csv: error 40.0 %")
-    )
+    reason = found["c"].reasons[0]
+    assert reason.startswith("c: worse than a constant torque on val.csv: error 40.0 %")
     assert found["d"].reasons == ("it does not move in any validation log",)
 
 
@@ -110,9 +109,8 @@ def test_the_good_joint_with_the_largest_error_has_the_cause_of_its_residual():
     fit = Metrics({name: joint(5.0) for name in "abc"}, 1.0)
     causes = {"b": ("it is noise", "Do this")}  # of no other joint is the cause computed
     found = judge(Predictions(fit, logs), Determined(), cause_of=causes.__getitem__)
-    assert found.joints["b"].reasons[1:] == (
-        "largest error of the good joints: it is noise. Do this",
-    )
+    _, reason = found.joints["b"].reasons
+    assert reason == "largest error of the good joints: it is noise. Do this"
     assert [len(found.joints[name].reasons) for name in "ac"] == [1, 1]
     assert not any("noise" in reason for reason in found.reasons)  # another joint is worse
     logs = {"val.csv": Metrics({"a": joint(4.0), "b": joint(6.0)}, 1.0)}
@@ -184,9 +182,8 @@ def test_each_threshold_lies_where_it_is_stated(error, fitted, status):
 def test_a_doubt_is_about_the_joints_that_the_finding_names(where, joints):
     found = warnings_of([finding("unexplained_torque", where)], JOINTS)
     assert [doubt.joint for doubt in found] == joints
-    assert found[0].message.startswith(
-        "run.csv: gravity," if joints == [""] else "gravity, inertia"
-    )
+    start = "run.csv: gravity," if joints == [""] else "gravity, inertia"
+    assert found[0].message.startswith(start)
 
 
 def test_notes_errors_and_harmless_warnings_raise_no_doubt():
@@ -238,9 +235,8 @@ def test_a_hypothesis_is_refuted_by_the_worst_of_all_logs_of_its_joints():
     guesses = [finding("unexplained_torque", f"run.csv: {where}") for where in ("a", "b", "a, b")]
     found = rejected([*guesses, finding("urdf_mismatch", "run.csv")], logs, ScaleCheck())
     assert [f.severity for f in found] == ["warning", "note", "warning", "warning"]
-    assert found[1].message == (
-        "run.csv: what was found; rejected: torque error on validation logs at most 3.0 %"
-    )
+    expected = "run.csv: what was found; rejected: torque error on validation logs at most 3.0 %"
+    assert found[1].message == expected
     repeated = finding("repeated_motion", "one")
     assert rejected([repeated, guesses[1]], logs, ScaleCheck())[1].severity == "warning"
     alike = finding("unexplained_torque", "all joints")

@@ -321,9 +321,8 @@ def test_a_projection_is_of_the_parameters_with_a_variance_and_the_prior(rng):
     case.is_minimum(found, A, root @ beta[own])
     assert (found.rank, found.condition, found.converged) == (6, 9.0, True)
     assert found.n_iter > 41
-    assert found.message.startswith(
-        "rls; projected onto physically consistent parameters, interior"
-    )
+    expected = "rls; projected onto physically consistent parameters, interior"
+    assert found.message.startswith(expected)
     assert "c" in found.undetermined
     with pytest.raises(DataError, match="the estimate has no covariance"):
         case.fit.project(replace(running, covariance=np.full((7, 7), np.inf)))

@@ -59,9 +59,8 @@ def test_sums_of_parts_merge_into_those_of_the_whole(rng):
     for j, name in enumerate("ab"):
         found, rows = merged.per_joint[name], mask[:, j]
         residual = np.sum((tau - prediction)[rows, j] ** 2)
-        assert found.r2 == pytest.approx(
-            1 - residual / np.sum((tau[rows, j] - tau[rows, j].mean()) ** 2)
-        )
+        wanted = 1 - residual / np.sum((tau[rows, j] - tau[rows, j].mean()) ** 2)
+        assert found.r2 == pytest.approx(wanted)
         assert found.rows == rows.sum()
         assert found.relative_error_pct == pytest.approx(whole.per_joint[name].relative_error_pct)
         assert found.baselines == pytest.approx(whole.per_joint[name].baselines)

@@ -158,9 +158,8 @@ def test_one_more_run_narrows_intervals_as_much_as_expected():
         (after,) = SpreadModel(alone(x, 0.1)).predict()
         expected.append((before.after[0] / before.std_error, before.after[1] / np.ptp(before.ends)))
         found.append((after.std_error / before.std_error, np.ptp(after.ends) / np.ptp(before.ends)))
-    assert np.mean(np.log(found), axis=0) == pytest.approx(
-        np.mean(np.log(expected), axis=0), abs=0.05
-    )
+    wanted = np.mean(np.log(expected), axis=0)
+    assert np.mean(np.log(found), axis=0) == pytest.approx(wanted, abs=0.05)
 
 
 def test_quantiles_and_probabilities_are_those_of_the_mixture():
@@ -246,9 +245,8 @@ def test_correlation_is_shrunk_by_its_uncertainty():
         left.append(np.sqrt(1 - min(above / below, 1.0)))
     assert len({round(a, 3) for a in left}) == 3  # a factor for each parameter
     wanted = np.outer(left, left) * np.corrcoef(x.T)
-    assert shrunk_correlation(x) - np.eye(3) == pytest.approx(
-        wanted - np.diag(np.diag(wanted)), abs=2e-3
-    )
+    expected = wanted - np.diag(np.diag(wanted))
+    assert shrunk_correlation(x) - np.eye(3) == pytest.approx(expected, abs=2e-3)
     true = np.array([[1.0, 0.7], [0.7, 1.0]])
     many = rng.multivariate_normal([5.0, -2.0], true, 5000) * np.array([1e-3, 40.0])
     assert shrunk_correlation(many) == pytest.approx(true, abs=0.03)

@@ -163,9 +163,8 @@ def test_findings_of_the_fit_have_its_figures(found):
     assert gains.evidence == {"scale": pytest.approx(1.234), "std_error": 0.0152}
     friction = said["friction_found"]
     assert friction.where == "turn"
-    assert friction.message == (
-        "turn: stribeck and load lowers the squared error of held-out windows by 32 %"
-    )
+    wanted = "turn: with stribeck and load the squared error of held-out windows is 32 % smaller"
+    assert friction.message == wanted
     assert friction.evidence == {"gain_pct": pytest.approx(31.6)}
     assert said["scale"].severity == "note"
     quiet = of(found, details={**details, "halving": 0.99})

@@ -98,9 +98,8 @@ def test_widths_are_those_of_draws_from_the_covariance(identified):
             figure = found[key][inner] if inner else found[key]
             width = figure["high"] - figure["low"]
             assert width == pytest.approx(2 * reach * values.std(), rel=0.04), (key, inner)
-            assert figure["nominal"] == pytest.approx(
-                (figure["high"] + figure["low"]) / 2, rel=1e-3
-            )
+            expected = (figure["high"] + figure["low"]) / 2
+            assert figure["nominal"] == pytest.approx(expected, rel=1e-3)
 
 
 def test_what_is_drawn_is_possible_however_wide_the_intervals(identified):

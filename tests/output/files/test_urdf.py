@@ -324,20 +324,17 @@ def test_a_replaced_element_is_indented_like_the_file():
 
 def test_a_self_closing_element_is_opened():
     data = b'<r>\n    <l n="a" />\n</r>'
-    assert edited(data, lambda d: insert(d, first(d, "l"), LINES)) == (
-        b'<r>\n    <l n="a" >\n        <new>\n            <a/>\n        </new>\n    </l>\n</r>'
-    )
+    wanted = b'<r>\n    <l n="a" >\n        <new>\n            <a/>\n        </new>\n    </l>\n</r>'
+    assert edited(data, lambda d: insert(d, first(d, "l"), LINES)) == wanted
 
 
 def test_a_removed_element_takes_its_lines_along_only_if_it_has_them_alone():
     alone = b"<r>\n  <l>\n    <old>\n    </old>  \n    <k/>\n  </l>\n</r>"
-    assert edited(alone, lambda d: remove(d, first(d, "l", "old"))) == (
-        b"<r>\n  <l>\n    <k/>\n  </l>\n</r>"
-    )
+    wanted = b"<r>\n  <l>\n    <k/>\n  </l>\n</r>"
+    assert edited(alone, lambda d: remove(d, first(d, "l", "old"))) == wanted
     shared = b"<r>\n  <l>\n    <old/> <!-- kept -->\n  </l>\n</r>"
-    assert edited(shared, lambda d: remove(d, first(d, "l", "old"))) == (
-        b"<r>\n  <l>\n     <!-- kept -->\n  </l>\n</r>"
-    )
+    wanted = b"<r>\n  <l>\n     <!-- kept -->\n  </l>\n</r>"
+    assert edited(shared, lambda d: remove(d, first(d, "l", "old"))) == wanted
 
 
 def test_attributes_are_changed_in_place_and_missing_ones_added():

@@ -289,9 +289,8 @@ def test_a_verdict_shows_three_reasons_and_folds_all_others():
     )
     assert "<summary>1 more reason</summary>" in verdict_html("arm", "poor", "abcd")
     assert "<details>" not in verdict_html("arm", "good", "abc")
-    assert verdict_html("arm", "good", [], "a < b").endswith(
-        '<ul></ul><p class="uses">a &lt; b</p></div>\n'
-    )
+    expected = '<ul></ul><p class="uses">a &lt; b</p></div>\n'
+    assert verdict_html("arm", "good", [], "a < b").endswith(expected)
 
 
 def test_a_command_breaks_between_arguments_only():

@@ -80,9 +80,8 @@ def test_each_parameter_has_its_figures_and_what_one_more_log_would_change(varia
     page = variation_section(variation, {"one": "1.23 N m", "two": "0.4 N m"})
     (caption, table), *others = tables(page).items()
     assert not others
-    assert caption == (
-        "Drive parameters in 3 logs; low to high: 95 % of the next log of this robot"
-    )
+    expected = "Drive parameters in 3 logs; low to high: 95 % of the next log of this robot"
+    assert caption == expected
     rows = table.rows
     assert rows[0] == [
         "one.coulomb", "4.10 ± 0.12", "3.700 ± 0.020", "6.00 ± 0.30", "4.21", "0.25", "0.88",
