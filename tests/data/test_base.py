@@ -82,9 +82,8 @@ def test_a_base_is_differentiated_by_its_own_time_stamps(rng):
     slope = np.column_stack([2 * t, np.ones(60)])
     np.testing.assert_allclose(found[1:-1, :3], (slope @ C[:2, :3] @ R)[1:-1], rtol=1e-7)
     np.testing.assert_allclose(found[:, 3:], 0.0, atol=1e-9)
-    np.testing.assert_allclose(
-        acceleration[2:-2, :3], np.tile(2 * C[0, :3] @ R, (56, 1)), rtol=1e-6
-    )
+    wanted = np.tile(2 * C[0, :3] @ R, (56, 1))
+    np.testing.assert_allclose(acceleration[2:-2, :3], wanted, rtol=1e-6)
     acceleration = base_state(t, pose, twist, None)[2]
     np.testing.assert_allclose(acceleration[1:-1], (slope @ C[:2])[1:-1], rtol=1e-7)
 
@@ -340,9 +339,8 @@ def test_an_imu_has_the_acceleration_of_the_base(motion):
         assert np.abs(found[1][:, :3]).max() * (1 - position) == 0.0
         np.testing.assert_allclose(found[1][some, 3:], twist[some, 3:], atol=2e-4)
         np.testing.assert_allclose(found[2][some, 3:], acceleration[some, 3:], atol=2e-2)
-        np.testing.assert_allclose(
-            specific_force(*found)[some], specific_force(pose, twist, acceleration)[some], atol=5e-3
-        )
+        wanted = specific_force(pose, twist, acceleration)[some]
+        np.testing.assert_allclose(specific_force(*found)[some], wanted, atol=5e-3)
     whole = base_state(t, pose, None, None, imu)
     np.testing.assert_allclose(whole[2][some], acceleration[some], atol=2e-2)
     offset = np.array([0.3, -0.2, 0.1])  # of the accelerometers, with the axes of the base

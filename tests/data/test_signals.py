@@ -131,9 +131,8 @@ def test_full_turns_are_taken_out_of_free_joints_only():
     assert out.notes == ("full turns removed from the angle of a",)
     assert unwrap(log, np.array([True, True])) is out, "so that its motions are kept"
     other = replace(log, q=wrapped + np.array([0.0, 1.0]))
-    np.testing.assert_allclose(
-        unwrap(other, np.array([True, False])).q, angle + np.array([0.0, 1.0])
-    )
+    wanted = angle + np.array([0.0, 1.0])
+    np.testing.assert_allclose(unwrap(other, np.array([True, False])).q, wanted)
     steady = replace(log, q=0.1 * angle)
     assert unwrap(steady, np.array([True, True])) is steady
     with pytest.raises(DataError, match=r"q_a jumps by a full turn at t = 1.58 s"):
@@ -589,8 +588,7 @@ def test_a_drive_sticks_that_is_slow_for_longer_than_its_slopes_say(
         w = np.where(t < in_ + slow / 2, way_in, way_out)
         found = acting_directions(t, w[:, None], BAND, longest=2.0)[:, 0]
         stuck = np.interp(t, [in_, out], [before, after])
-        np.testing.assert_allclose(
-            found, stuck if sticks else np.sign(w), atol=1e-6 if share < 1 else 2e-3
-        )
+        wanted = stuck if sticks else np.sign(w)
+        np.testing.assert_allclose(found, wanted, atol=1e-6 if share < 1 else 2e-3)
         sharp = acting_directions(t, w[:, None], BAND, longest=0.99 * slow)[:, 0]
         np.testing.assert_array_equal(sharp, np.sign(w))

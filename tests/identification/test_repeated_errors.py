@@ -124,9 +124,8 @@ def test_the_size_of_offsets_is_that_of_the_density_of_the_rows(rng):
     H = rows.T @ rows / sigma**2
     H[range(3, 5), range(3, 5)] += sizes[:2] ** -2.0
     H[range(5, 12), range(5, 12)] += found.size**-2.0
-    np.testing.assert_allclose(
-        found.covariance[:2, :2], np.linalg.inv(H)[3:5, 3:5], rtol=0.02, atol=1e-12
-    )
+    expected = np.linalg.inv(H)[3:5, 3:5]
+    np.testing.assert_allclose(found.covariance[:2, :2], expected, rtol=0.02, atol=1e-12)
     assert not found.covariance[2:].any()
     assert not found.known[2:].any()
     signs = np.where(np.arange(12) < 3, 1.0, -1.0)  # tau is W pi - D x

@@ -259,9 +259,8 @@ def test_terms_of_one_drive_stand_side_by_side():
 def test_a_guarded_term_stays_as_it_was_at_the_end_of_what_was_seen():
     v = np.array([-9.0, -1.0, 0.5, 2.0, 9.0])
     motion = DriveMotion(v, v, v, np.sign(v), v, v)
-    np.testing.assert_allclose(
-        Cubic(data_range=(0.0, 1.5)).column(motion), [-(1.5**3), -1.0, 0.125, 1.5**3, 1.5**3]
-    )
+    wanted = [-(1.5**3), -1.0, 0.125, 1.5**3, 1.5**3]
+    np.testing.assert_allclose(Cubic(data_range=(0.0, 1.5)).column(motion), wanted)
     hook = Stribeck(data_range=(0.8, 2.0), speed=0.5).column(motion)
     np.testing.assert_allclose(hook, np.exp(-2 * np.array([2, 1, 0.8, 2, 2])) * np.sign(v))
     wave = Harmonic(data_range=(-1.0, 2.0), order=3.0).column(motion)
@@ -332,9 +331,8 @@ def test_a_trajectory_without_its_memory_is_refused(rng):
     with pytest.raises(DataError, match=r"memory has shape \(70, 0\), expected \(70, 1\)"):
         predict(model, [truth(model)], x)
     load = drive_motion_along(model, x).load
-    np.testing.assert_allclose(
-        remember(model, x).memory[:, 0], np.sign(x.v[:, 1]) * np.abs(load[1]), atol=1e-12
-    )
+    wanted = np.sign(x.v[:, 1]) * np.abs(load[1])
+    np.testing.assert_allclose(remember(model, x).memory[:, 0], wanted, atol=1e-12)
 
 
 @pytest.mark.parametrize(

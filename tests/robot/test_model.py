@@ -77,9 +77,8 @@ def test_every_kind_of_joint_has_one_coordinate(tmp_path, kind, axis):
     assert configurations.shape == (2, model.pin_model.nq)
     neutral = pin.neutral(model.pin_model)
     for row, configuration in zip(q, configurations, strict=True):
-        np.testing.assert_allclose(
-            configuration, pin.integrate(model.pin_model, neutral, row), atol=1e-15
-        )
+        wanted = pin.integrate(model.pin_model, neutral, row)
+        np.testing.assert_allclose(configuration, wanted, atol=1e-15)
 
 
 def test_joints_come_in_the_order_asked_for(tmp_path):
@@ -323,9 +322,10 @@ def chain(tmp_path):
 
 def test_limits_are_those_stated_and_a_continuous_joint_has_no_range(chain):
     limit = LIMIT.format(-1, 2)
-    turn, endless, point = read_tree(
-        chain(("revolute", limit), ("continuous", limit), ("revolute", LIMIT.format(0, 0)))
-    ).joints
+    joints = ("revolute", limit), ("continuous", limit), ("revolute", LIMIT.format(0, 0))
+    tree = read_tree(chain(*joints))
+    turn, endless, point = tree.joints
+    assert tree.carriers == {"j1": [], "j2": ["j1"], "j3": ["j2", "j1"]}
     assert (turn.lower, turn.upper, turn.velocity, turn.effort) == (-1, 2, 2, 9)
     assert (endless.lower, endless.upper, endless.velocity) == (-math.inf, math.inf, 2)
     assert [joint.has_limits for joint in (turn, endless, point)] == [True, False, False]

@@ -99,6 +99,7 @@ def test_the_fit_is_the_least_squares_of_all_joints_and_drives(ur5, ur5_log):
     N, n, bodies = len(probe.rows), 6, 6
     drives = drive_columns(ur5, probe.q, probe.v, probe.a)
     pi = ur5.standard_parameters()[: ur5.layout.n_inertial].reshape(-1, 10)
+    np.testing.assert_allclose(model.spread[6:], pi[:, 0].sum() * np.append(1, 3 * [ur5.length]))
     Y = joint_torque_regressor(ur5, probe.q, probe.v, probe.a)[:, : ur5.layout.n_inertial]
     Y = Y.reshape(N, n, bodies, 10)
     rows, right = [np.eye(10) / model.spread[:, None]], [model.mean / model.spread]

@@ -82,15 +82,13 @@ def test_the_parts_sum_to_the_prediction(name, is_possible, rng):
     whole = (joint_torque_regressor(model, q, v, a) @ pi).reshape(v.shape)
     np.testing.assert_allclose(sum(split.parts.values()), whole, rtol=1e-12, atol=1e-11)
     rigid = np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
-    np.testing.assert_allclose(
-        split.load, (joint_torque_regressor(model, q, v, a) @ rigid).reshape(v.shape), atol=1e-11
-    )
+    wanted = (joint_torque_regressor(model, q, v, a) @ rigid).reshape(v.shape)
+    np.testing.assert_allclose(split.load, wanted, atol=1e-11)
     for row in range(model.n_rows):  # what drive parameters add, is what the drives' parts are
         every = [x for own in split.terms_of(row).values() for x in own.values()]
         drives = sum(every, start=np.zeros(len(q)))
-        np.testing.assert_allclose(
-            drives, (sum(split.parts.values()) - split.load)[:, row], atol=1e-11
-        )
+        wanted = (sum(split.parts.values()) - split.load)[:, row]
+        np.testing.assert_allclose(drives, wanted, atol=1e-11)
 
 
 def test_every_kind_of_drive_term_has_its_part(rng):
@@ -109,9 +107,8 @@ def test_every_kind_of_drive_term_has_its_part(rng):
     scale = np.abs(whole).max()
     np.testing.assert_allclose(sum(split.parts.values()), whole, atol=1e-12 * scale)
     np.testing.assert_allclose(split.parts["spring"][:, 0], 7.0 * m.q[:, 0], atol=1e-12 * scale)
-    np.testing.assert_allclose(
-        split.parts["ripple"][:, 0], 2.0 * np.cos(3 * m.q[:, 0]), atol=1e-12 * scale
-    )
+    wanted = 2.0 * np.cos(3 * m.q[:, 0])
+    np.testing.assert_allclose(split.parts["ripple"][:, 0], wanted, atol=1e-12 * scale)
     index = list(model.layout.names).index
     armature, offset = (
         np.array([pi[index(f"{joint}.{term}")] for joint in model.joints])
@@ -122,9 +119,8 @@ def test_every_kind_of_drive_term_has_its_part(rng):
     friction = [f"{LIFT}.{x}" for x in ("viscous", "coulomb", "load")]
     own = split.terms_of(0)["friction"]
     assert list(own) == friction
-    np.testing.assert_allclose(
-        split.parts["friction"][:, 0], sum(own[x] for x in friction), atol=1e-12 * scale
-    )
+    wanted = sum(own[x] for x in friction)
+    np.testing.assert_allclose(split.parts["friction"][:, 0], wanted, atol=1e-12 * scale)
     assert set(split.parts) == {
         "gravity", "inertia", "Coriolis", "motor inertia", "friction", "offset", "spring", "ripple",
         "delay",
@@ -148,15 +144,13 @@ def test_a_joint_is_judged_on_what_was_kept_apart(identified):
         measured = kept.metrics["estimate"].per_joint[names[j]]
         motion = kept.recording.trajectory
         assert torque.rows.recordings == (kept.recording.name,)
-        np.testing.assert_allclose(
-            torque.residual, (motion.tau - kept.torques["estimate"])[:, j], atol=1e-11
-        )
+        wanted = (motion.tau - kept.torques["estimate"])[:, j]
+        np.testing.assert_allclose(torque.residual, wanted, atol=1e-11)
         assert torque.rms["residual"] == pytest.approx(measured.rmse)
         expected = measured.rmse * 100 / measured.relative_error_pct
         assert torque.rms["measured"] == pytest.approx(expected)
-        np.testing.assert_allclose(
-            sum(torque.parts.values()) + torque.residual, motion.tau[:, j], atol=1e-11
-        )
+        wanted = motion.tau[:, j]
+        np.testing.assert_allclose(sum(torque.parts.values()) + torque.residual, wanted, atol=1e-11)
         # white noise is all that this log has beside its model
         assert torque.broadband > 0.5
         assert torque.fitted.rows.recordings == tuple(e.recording.name for e in identified.fitted)

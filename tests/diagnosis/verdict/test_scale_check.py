@@ -20,7 +20,8 @@ from robotid.diagnosis.verdict.scale_check import (
 )
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.estimation.fitting.estimator_settings import ConstraintSettings, EstimatorSettings
+from robotid.estimation.fitting.fit import pinned_joints
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia
 
@@ -329,6 +330,7 @@ def test_the_mass_that_remains_beside_a_pinned_link_is_determined(crane):
     boom = float(pi[0] + pi[10] - model.standard_parameters()[0])  # beside the URDF's cart
     stated = checked(model, log, mass={"boom": boom}, pinned=["cart"]).stated
     assert stated.ratio == pytest.approx(1.0, abs=0.03)
+    assert pinned_joints(ConstraintSettings(pinned=("cart",)), model) == model.joints[:1]
 
 
 def test_a_wide_range_is_a_bound_and_a_narrow_one_widens_the_interval(crane):

@@ -188,7 +188,6 @@ def test_data_sets_in_one_pass_are_fitted_as_one_by_one(rng):
             start = None if starts is None else starts[k]
             expected = fit.programme.minimise(sets[k], 0.3, start=start)
             assert every[k].n_iter == expected.n_iter
-            np.testing.assert_allclose(
-                every[k].x / fit.prior_std, expected.x / fit.prior_std, atol=1e-9
-            )
+            wanted = expected.x / fit.prior_std
+            np.testing.assert_allclose(every[k].x / fit.prior_std, wanted, atol=1e-9)
             np.testing.assert_allclose(every[k].multipliers, expected.multipliers, atol=1e-6)

@@ -29,9 +29,8 @@ def test_all_logs_together_have_48_stretches_of_ten_correlation_times_or_more(
     whole = recordings.reduce(is_cut=False)
     assert [reduction.samples for reduction in whole] == list(sizes)
     squares = sum(reduction.factors.torque_squares() for reduction in found)
-    np.testing.assert_allclose(
-        squares, sum(np.sum(log.whole.trajectory.tau**2, axis=0) for log in logs)
-    )
+    wanted = sum(np.sum(log.whole.trajectory.tau**2, axis=0) for log in logs)
+    np.testing.assert_allclose(squares, wanted)
 
 
 def test_errors_that_repeat_in_every_row_are_described_by_their_sizes():

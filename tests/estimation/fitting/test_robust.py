@@ -50,9 +50,8 @@ def test_losses_have_the_derivatives_and_efficiency_they_claim(loss):
     r, h = np.linspace(-8, 8, 161), 1e-6
     psi = [loss_weight(loss, x) * x for x in (r - h, r + h)]
     smooth = np.abs(np.abs(r) - LOSSES[loss]) > 1e-3
-    np.testing.assert_allclose(
-        loss_slope(loss, r)[smooth], ((psi[1] - psi[0]) / (2 * h))[smooth], atol=1e-6
-    )
+    wanted = ((psi[1] - psi[0]) / (2 * h))[smooth]
+    np.testing.assert_allclose(loss_slope(loss, r)[smooth], wanted, atol=1e-6)
     x = np.linspace(-9, 9, 20001)
     density = scipy.stats.norm.pdf(x) * (x[1] - x[0])
     variance = (density * (loss_weight(loss, x) * x) ** 2).sum()

@@ -176,9 +176,8 @@ def test_the_prior_makes_the_sandwich_of_its_formula(W):
     estimate = replace(wls, theta=theta, covariance=B, names=tuple("abcdef"))
     found, _ = measured_errors(estimate, parts, whole, share, K, wls.sigma)
     meat = scatter(parts, K @ theta, wls.sigma, share * K @ B @ K.T).meat
-    np.testing.assert_allclose(
-        found.covariance, B @ (share**2 * K.T @ meat @ K + L) @ B, rtol=1e-6, atol=1e-12
-    )
+    wanted = B @ (share**2 * K.T @ meat @ K + L) @ B
+    np.testing.assert_allclose(found.covariance, wanted, rtol=1e-6, atol=1e-12)
 
 
 def test_what_is_scattered_beside_the_rows_adds_to_the_meat(W):
@@ -272,6 +271,5 @@ def test_with_active_bounds_errors_are_those_of_resampled_fits(W, rng, count):
     if count == 11:
         wide = measured_errors(*every, weight_ratio=3.0)[0]
         L = np.diag(np.arange(1.0, 7.0))
-        np.testing.assert_allclose(
-            wide.covariance, C @ (share * K.T @ R.T @ R @ K + 3.0 * L) @ C, atol=1e-9
-        )
+        expected = C @ (share * K.T @ R.T @ R @ K + 3.0 * L) @ C
+        np.testing.assert_allclose(wide.covariance, expected, atol=1e-9)

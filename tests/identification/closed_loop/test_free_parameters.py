@@ -274,6 +274,8 @@ def test_gains_are_those_of_fits_to_the_other_folds(rng):
     bounded = _gains(H, g, [0, 2], sets, least)
     assert not bounded[7].any(), "every step is beyond the bound"
     np.testing.assert_array_equal(bounded[9], found[9])
+    least[1], least[3] = -np.inf, np.inf  # of the second column of a set
+    assert not _gains(H, g, [0, 2], sets, least)[9].any()
     for k, (A, b) in enumerate(parts):
         others = [part for i, part in enumerate(parts) if i != k]
         A_f, b_f = (np.concatenate(x) for x in zip(*others, strict=True))

@@ -269,11 +269,14 @@ def test_free_gains_are_recovered_from_logs_with_stated_ratios(leg, other_log):
 
 
 def test_a_log_with_other_gains_is_named_with_their_ratio(found, other_log):
-    run = run_open_loop(found.fit.simulator.robot, found.fit.loops, other_log)
-    findings = loop_findings(replace(found, validation=(run,)), ())
-    named = {one.joints: one for one in findings if one.code == "other_gains"}
-    assert list(named) == [(joint,) for joint in other_log.joints[1:]]
-    for one in named.values():
+    named = []
+    for known in (np.ones((2, 3)), RATIOS**0.2):  # of the ratios, by the job
+        log = replace(other_log, gain_factors=known)
+        run = run_open_loop(found.fit.simulator.robot, found.fit.loops, log)
+        findings = loop_findings(replace(found, validation=(run,)), ())
+        named += [one for one in findings if one.code == "other_gains"]
+    assert [one.joints for one in named] == [(joint,) for joint in other_log.joints[1:]] * 2
+    for one in named:
         entry = tomllib.loads(one.message.partition("of the job: ")[2])["controller"]
         gains = LogGains.from_dict(entry).factors(found.loop, other_log.joints)
         np.testing.assert_allclose(gains, RATIOS, rtol=0.15)

@@ -23,6 +23,7 @@ from robotid.diagnosis.residual.misfit import (
 from robotid.diagnosis.verdict.verdict import JointVerdict, Verdict
 from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.result import TorqueIdentification
 from robotid.output.report.next_steps import Origin, Step, _once, next_steps, sentence_of
 from robotid.robot.examples import example_urdf
 
@@ -160,6 +161,16 @@ def test_a_named_cause_has_its_step_and_no_guess_beside_it(identified, code, rng
         assert set(dict(made.ratios)) == {joint, "wrist_1_joint"}
     alone = told(identified, warning("unexplained_torque"))
     assert any(_guesses(step, joint) for step in next_steps(alone, JOB))
+
+
+def test_a_residual_is_examined_for_the_cause_at_each_joint(identified, monkeypatch):
+    for other, said in (("Try friction", "elbow_joint: Try friction."), ("Look", "replay. Look.")):
+        causes = {"elbow_joint": ("", other)}
+        cause_of = lambda _, joint, known=causes: known.get(joint, ("", "Look"))  # noqa: E731
+        monkeypatch.setattr(TorqueIdentification, "residual_cause", cause_of)
+        found = told(identified, warning("unexplained_torque"))
+        (step,) = [x for x in next_steps(found, JOB) if x.words.startswith("Examine the residual")]
+        assert said in step.words
 
 
 def _guesses(step, joint):

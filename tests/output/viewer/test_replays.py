@@ -312,9 +312,8 @@ def test_the_strip_is_of_the_first_prediction_over_what_it_is_compared_to(arm, m
         assert len(others) == (quantity == "torque")
         for strip in others:
             mean = np.sqrt(np.mean((strip / 100.0) ** 2, axis=0))
-            np.testing.assert_allclose(
-                mean, np.sqrt(np.mean((q - other) ** 2, axis=0)) / of, rtol=0.05
-            )
+            expected = np.sqrt(np.mean((q - other) ** 2, axis=0)) / of
+            np.testing.assert_allclose(mean, expected, rtol=0.05)
 
 
 @pytest.mark.parametrize(("change", "message"), [
