@@ -192,6 +192,7 @@ class Fit(Identified, Solution):
     factors: Factors  # triangular factors of the fitted rows, base parameters
     determination: Determination  # which base parameters the fitted rows determine
     open_terms: tuple[OpenTerm, ...] = ()  # uncertain terms, in the covariance
+    repeated: Array | None = None  # (p, p), the covariance due to errors that repeat
     regressor_noise: RegressorNoise | None = None  # of position quantisation; or negligible
     runs: tuple[RunsOf, ...] = ()  # information of three or more logs on varying parameters
     sums: RunSums | None = None  # sums over their rows from which it is computed
@@ -340,6 +341,12 @@ class Fit(Identified, Solution):
                 return band
         return expected_band(self, evaluation, self.between)
 
+    @property
+    def torque_covariance(self) -> Array:
+        """Covariance (p, p) of parameters in torques, where the residual has what repeats."""
+        C = self.standard_covariance
+        return C if self.repeated is None else C - self.repeated
+
     @cached_property
     def between(self) -> Array | None:
         """What another log adds to the parameters' covariance, (p, p); None for under 3 logs."""
@@ -426,7 +433,7 @@ def expected_band(fit: Fit, evaluation: Evaluation, between: Array | None = None
     """Return the torque band of a recording by the noise level of the fit; between (p, p)."""
     K, recording = fit.mapping.K, evaluation.recording
     moves = np.array([term.moves for term in fit.open_terms]).reshape(-1, K.shape[1])
-    C = fit.standard_covariance - moves.T @ moves
+    C = fit.torque_covariance - moves.T @ moves
     covariance = K @ (C if between is None else C + between) @ K.T
 
     def errors(rows: Array) -> list[tuple[Array, Array]]:
@@ -434,7 +441,10 @@ def expected_band(fit: Fit, evaluation: Evaluation, between: Array | None = None
         torques = open_torques(model, fit.open_terms, recording, rows)
         return list(zip(moves @ K.T, torques, strict=True))
 
-    sigma = fit.estimate.sigma
+    sigma, basis = fit.estimate.sigma, recording.trajectory.basis
+    if basis is not None:  # noise that unknown forces can cause is no part of the rows
+        left, used = 1.0 - np.sum(basis**2, axis=2), recording.mask
+        sigma = sigma * np.sqrt(np.sum(left, axis=0, where=used) / np.maximum(used.sum(axis=0), 1))
     return torque_band(fit.model, fit.mapping, recording.trajectory, covariance, sigma, errors)
 
 

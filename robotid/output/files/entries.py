@@ -74,7 +74,9 @@ def build_result(
 
 
 def _torque_entries(found: TorqueIdentification, settings: Mapping[str, Any]) -> dict[str, Any]:
-    names = found.model.layout.names
+    names, covariances = found.model.layout.names, {"covariance": found.standard_covariance}
+    if found.repeated is not None:
+        covariances["torque_covariance"] = found.torque_covariance
     return {
         "structure": _determined(found),
         "uncertainty": {
@@ -82,7 +84,7 @@ def _torque_entries(found: TorqueIdentification, settings: Mapping[str, Any]) ->
             "segments": found.errors.segments,
             "inflation": found.errors.inflation,
         },
-        "covariance": covariance_entry(names, found.standard_covariance, found.at_bound),
+        **{key: covariance_entry(names, C, found.at_bound) for key, C in covariances.items()},
         "motors": _motors(found, settings),
         "friction": {drive.joint: _friction(found, drive) for drive in found.drives},
         "consistency": {

@@ -197,7 +197,7 @@ def test_the_band_of_a_recording_has_each_open_term_with_what_it_moves(rng):
     ]
     found = SimpleNamespace(
         model=model, mapping=mapping, standard=standard, open_terms=tuple(own),
-        standard_covariance=root.T @ root + moves.T @ moves,
+        torque_covariance=root.T @ root + moves.T @ moves,
         estimate=SimpleNamespace(sigma=np.array([3.0, 1.0, 0.5])),
     )  # fmt: skip
     recording = SimpleNamespace(trajectory=motion, signals=SignalSettings(cutoff=5.0))
