@@ -278,9 +278,7 @@ def _factors_of(
     return Factors(tuple(triangles), tuple(columns), rows, problem.names, problem.is_projected)
 
 
-def compress_segments(
-    problem: Problem, length: int, *, threads: int | None = None
-) -> tuple[Factors, ...]:
+def compress_segments(problem: Problem, length: int) -> tuple[Factors, ...]:
     """Fold each segment of a problem into its own factors, for held-out segments."""
     if not problem.sources:
         raise DataError("the problem has blocks only, expected row sources to cut into segments")
@@ -289,7 +287,7 @@ def compress_segments(
     segments = []
     for source in problem.sources:
         places, starts = _places(source, columns), range(0, source.samples, length)
-        folded = _folded(source, part, length, threads)
+        folded = _folded(source, part, length, None)
         for start, triangles in zip(starts, folded, strict=True):
             rows = source.rows(start, min(start + length, source.samples))
             placed = []

@@ -251,7 +251,7 @@ class Solved:
         mapping, K = logs.mapping, logs.mapping.K
         estimate, wls, errors = self._measured(ground)
         _, covariance = standard_of(estimate, mapping, before.pi, before.spread)
-        repeated = None
+        repeated: Array | float = 0.0
         if logs.repeated is not None:
             alone = self._measured(replace(ground, recordings=replace(logs, repeated=None)))[0]
             repeated = covariance - standard_of(alone, mapping, before.pi, before.spread)[1]

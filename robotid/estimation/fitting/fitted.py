@@ -192,7 +192,7 @@ class Fit(Identified, Solution):
     factors: Factors  # triangular factors of the fitted rows, base parameters
     determination: Determination  # which base parameters the fitted rows determine
     open_terms: tuple[OpenTerm, ...] = ()  # uncertain terms, in the covariance
-    repeated: Array | None = None  # (p, p), the covariance due to errors that repeat
+    repeated: Array | float = 0.0  # (p, p), covariance due to errors that torques repeat
     regressor_noise: RegressorNoise | None = None  # of position quantisation; or negligible
     runs: tuple[RunsOf, ...] = ()  # information of three or more logs on varying parameters
     sums: RunSums | None = None  # sums over their rows from which it is computed
@@ -341,12 +341,6 @@ class Fit(Identified, Solution):
                 return band
         return expected_band(self, evaluation, self.between)
 
-    @property
-    def torque_covariance(self) -> Array:
-        """Covariance (p, p) of parameters in torques, where the residual has what repeats."""
-        C = self.standard_covariance
-        return C if self.repeated is None else C - self.repeated
-
     @cached_property
     def between(self) -> Array | None:
         """What another log adds to the parameters' covariance, (p, p); None for under 3 logs."""
@@ -433,7 +427,7 @@ def expected_band(fit: Fit, evaluation: Evaluation, between: Array | None = None
     """Return the torque band of a recording by the noise level of the fit; between (p, p)."""
     K, recording = fit.mapping.K, evaluation.recording
     moves = np.array([term.moves for term in fit.open_terms]).reshape(-1, K.shape[1])
-    C = fit.torque_covariance - moves.T @ moves
+    C = fit.standard_covariance - fit.repeated - moves.T @ moves
     covariance = K @ (C if between is None else C + between) @ K.T
 
     def errors(rows: Array) -> list[tuple[Array, Array]]:
