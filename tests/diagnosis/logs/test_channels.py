@@ -350,7 +350,7 @@ def test_gaps_are_counted_and_the_longest_has_its_time():
     # before it, 300 steps of which one is a gap of 40 ms in place of 8
     at = START + 300 * 0.01 + 0.032
     assert Figures(gap) == {"gaps": 3, "longest": pytest.approx(0.5), "at": pytest.approx(at)}
-    words = "run.csv: the log has gaps in time (3): the longest of 0.5 s at t = 6.032"
+    words = "run.csv: the time stamps have gaps (3). The longest, at t = 6.032 s, lasts 0.5 s. "
     assert gap.message.startswith(words)
     # a gap has no part in the jitter
     assert found["jitter"].evidence["longest"] == pytest.approx(0.012)
