@@ -401,10 +401,10 @@ def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:
 
 
 def stated_covariance(result: Mapping[str, Any], names: Sequence[str]) -> Array | None:
-    """Return the covariance of parameters of a result; None if an earlier version wrote it."""
+    """Return the covariance of parameters in torques; None if an earlier version wrote it."""
     if "covariance" not in result:
         return None
-    stated = result["covariance"]
+    stated = result.get("torque_covariance", result["covariance"])
     require_lengths(stated["root"], [len(stated["names"])], "covariance.root")
     rows = dict(zip(stated["names"], stated["root"], strict=True))
     root = np.zeros((len(names), max(map(len, rows.values()), default=0)))

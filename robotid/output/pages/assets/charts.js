@@ -298,7 +298,8 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
       axes: [axis({ size: 28, label: name || null, labelSize: name ? 20 : 0, labelGap: 2,
         space: (u, i, low, high) => 36 + 7 * String(Math.trunc(high)).length,
         labelFont: "11px system-ui, sans-serif", ...decades("x") }),
-      axis({ size: 54, space: 22, ...decades("y") })],
+      // at least two labels: steps of ticks differ by at most 2.5, and a range is twice as long as its half
+      axis({ size: 54, space: Math.min(22, height / 5.5), ...decades("y") })],
       series: [{}, ...series.map(({ tone: colour, kind, is_weak: weak }, i) => ({ show: !this.hidden.has(i),
         stroke: () => tone(colour), width: 1.3, alpha: weak ? FAINT : 1, points: { show: false },
         ...(kind === "line" ? {} : { paths: () => null }) }))],
