@@ -297,7 +297,7 @@ def rigid_parts(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> l
     """Return gravity, inertia and velocity torques g, M a, C v of the bodies, (N, n_rows) each."""
     still = np.zeros_like(v)
     states = ((still, still), (still, a), (v, a))
-    g, g_and_Ma, total = (_bodies_torque(model, pi, q, *x) for x in states)
+    g, g_and_Ma, total = (bodies_torque(model, pi, q, *x) for x in states)
     return [g, g_and_Ma - g, total - g_and_Ma]
 
 
@@ -334,13 +334,13 @@ def _has_centres(model: RobotModel, pi: Array) -> bool:
 
 def inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
     """Return the torque W pi by the recursive Newton-Euler algorithm and the drives' terms."""
-    torque = _bodies_torque(model, pi, trajectory.q, trajectory.v, trajectory.a)
+    torque = bodies_torque(model, pi, trajectory.q, trajectory.v, trajectory.a)
     if pi[model.layout.n_inertial :].any():
         torque[:, model.n_rows - len(model.joints) :] += drive_torque(model, pi, trajectory)
     return torque
 
 
-def _bodies_torque(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> Array:
+def bodies_torque(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> Array:
     """Return the torque of bodies, of inconsistent ones as a difference, shape (N, n_rows)."""
     return _of_consistent(_newton_euler, model, pi, q, v, a)[0]
 
