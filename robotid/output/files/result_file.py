@@ -183,10 +183,11 @@ class Result:
         """Return the encoder readings simulated on a log's commands, (N, n) [rad or m]."""
         if not self.commanded:
             raise DataError(
-                f"{self.path.name} has no gains of drives, which a simulation on commands requires"
+                f"{self.path.name} has no gains of drives, which a simulation on commands "
+                "requires; identify from a log with commands"
             )
         if log.q_ref is None:
-            raise DataError(f"{log.name} has no commands, columns qref_ of each joint")
+            raise DataError(f"{log.name} has no commands, columns qref_ of each joint; log them")
         return self._signs * self.open_loop(log, horizons=()).q
 
     def open_loop(

@@ -65,7 +65,7 @@ class Cell:
     """One cell of a table."""
 
     html: str  # escaped
-    kind: str = ""  # style: "" for prose, "text" for short texts, "number", "code", "flag"
+    kind: str = ""  # style: "" for prose, "text" for short texts, "number", "code"; "flag" in red
     value: float | None = None  # the number in full precision
 
 
@@ -80,7 +80,8 @@ class Section(NamedTuple):
 
 def text(value: str, *, flag: bool = False) -> Cell:
     """Return a cell of text."""
-    return Cell(escape(value), "flag" if flag else "text" if len(value) < 24 else "")
+    short = "text" if len(value) < 24 else ""
+    return Cell(escape(value), f"flag {short}".strip() if flag else short)
 
 
 def code(value: str) -> Cell:

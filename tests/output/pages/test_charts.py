@@ -318,7 +318,7 @@ def test_a_small_error_of_a_plain_number_is_written_in_full():
 def test_a_cell_has_the_style_of_its_content_and_its_number_in_full():
     for cell, wanted in (
         (text("<" * 23), ("&lt;" * 23, "text", None)), (text("a" * 24), ("a" * 24, "", None)),
-        (text("a", flag=True), ("a", "flag", None)),
+        (text("a", flag=True), ("a", "flag text", None)),
         (code("a.b_c/<" + 10 * "d"), ("a.<wbr>b_<wbr>c/<wbr>&lt;dddddddddd", "code", None)),
         (code("wrist_1_joint/<_"), ("wrist_1_joint/&lt;_", "code", None)),
         (number(-12.3456), ("−12.35", "number", -12.3456)), (number(None), ("–", "number", None)),
