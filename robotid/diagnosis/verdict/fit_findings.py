@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from robotid.diagnosis.residual.misfit import Misfit, misfit_finding
 from robotid.diagnosis.urdf.inertials import DENSEST, audit_bodies
 from robotid.diagnosis.verdict.verdict import BEATEN, NAMED, SMALL, is_harmless_cost
 from robotid.estimation.estimators.consistent_fit import slabs
+from robotid.estimation.fitting.drive_terms import DriveChoice
 from robotid.estimation.fitting.estimator_settings import BoundedSettings, ConsistentSettings
 from robotid.estimation.fitting.fitted import CLEARLY, Fit, Identified
 from robotid.estimation.fitting.standard_errors import QUANTILE
@@ -118,6 +120,7 @@ def _of_static(fit: Fit) -> Finding:
 def _drive_findings(fit: Fit) -> Iterator[Finding]:
     """Yield notes on friction shapes at their bounds, and on motion outside the fitted range."""
     for choice in fit.drives:
+        yield from _late(fit, choice)
         for shape in choice.shapes:
             if shape.is_at_bound:
                 words = {"name": shape.name, "unit": shape.unit}
@@ -136,6 +139,17 @@ def _drive_findings(fit: Fit) -> Iterator[Finding]:
                         what={"q": "positions", "v": "speeds"}[key],
                         name=evaluation.recording.name, families=listed(choice.families),
                     )  # fmt: skip
+
+
+def _late(fit: Fit, choice: DriveChoice) -> Iterator[Finding]:
+    """Yield the delay of a torque that was selected as a term, -T d(tau)/dt, and is too long."""
+    selected = [one for one in choice.tried if one.is_selected]
+    for before, after in pairwise(selected):
+        explained = before.held_out_error_pct**2 - after.held_out_error_pct**2
+        if after.families[-1] == "lag" and explained > (100 * decisions.DIFFERS) ** 2:
+            k = fit.model.layout.names.index(f"{choice.joint}.lag")
+            sizes = {"size": fit.standard[k], "std_error": fit.standard_error[k]}
+            yield finding("joint_delay", "", choice.joint, explained=False, **sizes)
 
 
 def correlated_findings(fit: Fit) -> Iterator[Finding]:
@@ -382,6 +396,7 @@ def _of_outliers(fit: Fit) -> Finding:
     ) + f"; and {more} more" * (more > 0)
     return finding(
         "outliers", "", outliers[0].joint, where=places, cure=fit.estimator.is_robust,
+        severity="note" if fit.estimator.is_robust else "warning",
         count=f"{len(outliers)} outlier{'s' * (len(outliers) > 1)}", places=len(outliers),
         largest=outliers[0].size,
     )  # fmt: skip

@@ -17,6 +17,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.residual.discrepancies import alterations, explain_residual, readings
 from robotid.diagnosis.residual.misfit import find_misfits, settled
 from robotid.diagnosis.residual.term_trials import take_sample
+from robotid.diagnosis.verdict.fit_findings import fit_findings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import inverse_dynamics
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
@@ -38,11 +39,12 @@ def model():
 SETTINGS = EstimatorSettings(prior_weight=1.0)
 
 
-def fitted(model, logs, estimator=SETTINGS):
-    """Return the fit of a log, with plain friction, beside one kept apart."""
+def fitted(model, logs, estimator=SETTINGS, families=None):
+    """Return the fit of a log, with plain friction or families, beside one kept apart."""
     own, kept = ([hold_log(model, log, SignalSettings())] for log in logs)
     recordings = Recordings(model, structural_mapping(model), own, kept)
-    return with_drives(recordings, estimator, wanted_families("viscous+coulomb", model.joints))
+    families = families or wanted_families("viscous+coulomb", model.joints)
+    return with_drives(recordings, estimator, families)
 
 
 def found(model, change, robot="ur5_robot.urdf", turn=None, duration=16.0, estimator=None):
@@ -232,15 +234,26 @@ def test_a_joint_axis_of_another_direction_is_named(model, tmp_path, joint, key,
     assert "its axis is tilted by" in first.message
 
 
-def test_the_delay_of_one_torque_is_named(model):
-    def change(log):
-        tau = log.tau.copy()
-        tau[:, 2] = np.interp(log.t - 0.02, log.t, tau[:, 2])
-        return replace(log, tau=tau)
+def late(log, delay, joint=2):
+    """Return the log with one torque late."""
+    tau = log.tau.copy()
+    tau[:, joint] = np.interp(log.t - delay, log.t, tau[:, joint])
+    return replace(log, tau=tau)
 
-    (first,) = found(model, change)
+
+def test_the_delay_of_one_torque_is_named(model):
+    (first,) = found(model, lambda log: late(log, 0.02))
     assert (first.code, first.where) == ("joint_delay", "elbow_joint")
     assert first.evidence["size"] == pytest.approx(0.02, rel=0.25)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.06])
+def test_a_delay_that_was_selected_as_a_drive_term_is_named(four, delay):
+    plain = [log_with(four, 3, part=part, rate=50.0, duration=10.0) for part in (0, 1)]
+    logs = [late(log, delay, joint=0) for log in plain]
+    found = fit_findings(fitted(four, logs, families=dict.fromkeys(four.joints)))
+    sizes = [one.evidence["size"] for one in found if one.code == "joint_delay"]
+    assert sizes == pytest.approx([delay] * bool(delay), rel=0.25)
 
 
 def test_a_base_that_is_off_the_level_by_two_degrees_is_named(model):
