@@ -324,7 +324,6 @@ def _found(
         shape_covariance=tuple(tuple(row) for row in covariance.tolist()),
         sizes=tuple(tuple(own) for _, own in refined),
         data_range=drive.data_range,
-        grown=_grown(weighted, drive, refined),
     )  # fmt: skip
 
 

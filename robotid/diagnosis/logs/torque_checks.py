@@ -254,7 +254,8 @@ def _subtracted(probe: Probe, model: LoadModel) -> str:
     still = np.zeros_like(probe.v)
     weight = replace(probe, v=still, a=still).loads.sum(axis=2)
     whole = TorqueCheck.of(replace(probe, tau=probe.tau + weight))
-    if weight.any() and load_model(whole.probe, whole.share).is_this_robot():
+    chi, theta, _ = load_model(whole.probe, whole.share).fit()
+    if chi < decisions.BETTER * model.misfit(1.0) and _error_of_links(theta) < _MISMATCH:
         return "robot"
     R, rows = model.R.copy(), np.arange(len(model.R))
     R[..., -1] += R[..., :-5].sum(axis=-1)  # the torque of all links
@@ -270,32 +271,31 @@ def _reread(probe: Probe, share: Array, log: str) -> list[Finding]:
     """Return another clock or zeros with which the URDF's masses fit the torques, if there are."""
     from scipy.optimize import minimize_scalar
 
-    joints, speed = np.array(probe.model.joints), float(np.log(decisions.TENFOLD))
-    names = ("rows", "q", "v", "a", "tau", "contacts")
-    few = replace(probe, **{name: getattr(probe, name)[::_THINNED] for name in names})
+    joints, most = np.array(probe.model.joints), float(np.log(decisions.TENFOLD))
 
-    def read(probe: Probe, x: float, joint: str) -> Probe:
-        if joint:
-            return replace(probe, q=probe.q - x * (joints == joint))
-        return replace(probe, v=np.exp(x) * probe.v, a=np.exp(2.0 * x) * probe.a)
+    def read(x: float, joint: str, every: int = 1) -> Probe:
+        m, speed = probe.motion, 1.0 if joint else float(np.exp(x))
+        m = replace(m, q=m.q - x * (joints == joint), v=speed * m.v, a=speed**2 * m.a)
+        return Probe.of(probe.model, m, probe.rows[::every])
 
     def misfit(x: float, joint: str) -> float:
-        return load_model(read(few, x, joint), share).misfit(1.0)
+        return load_model(read(x, joint, _THINNED), share).misfit(1.0)
 
-    turning = [joint for joint in joints if joint not in probe.model.layout.prismatic]
-    near = [(joint, x, readings.OFFSET) for joint in turning for x in readings.QUARTERS]
+    turning = [x for x in joints.tolist() if x not in probe.model.layout.prismatic]
+    starts = [(joint, x, readings.OFFSET) for joint in turning for x in readings.QUARTERS]
     tried = [
-        (minimize_scalar(misfit, None, (x - most, x + most), joint, options=_NEAR), joint)
-        for joint, x, most in [("", 0.0, speed), *near]
+        (minimize_scalar(misfit, None, (x - far, x + far), joint, options=_NEAR), joint)
+        for joint, x, far in [("", 0.0, most), *starts]
     ]
     best, joint = min(tried, key=lambda x: x[0].fun)
     if misfit(0.0, "") - best.fun < SIGNIFICANT**2:
         return []
-    after, on = read(probe, best.x, joint), (joint,) * bool(joint)
-    code, size = "time_scale", {"offset": best.x} if joint else {"speed": np.exp(-best.x)}
-    if joint or best.x < -np.log(NO_ERROR_OF_MASSES):  # it is nine times less inertia, or none
-        code = "position_offset" if joint else "static_torque"
-    one = finding(code, log, on, severity="warning", what="log", cure="masses", also=False, **size)
+    after, code = read(best.x, joint), "position_offset" if joint else "time_scale"
+    if not joint and best.x < -np.log(NO_ERROR_OF_MASSES):  # nine times less inertia, or none
+        code = "static_torque"
+    values: dict[str, float | str] = {"what": "log", "cure": "masses", "also": False}
+    values |= {"offset": best.x} if joint else {"speed": np.exp(-best.x)}
+    one = finding(code, log, (joint,) * bool(joint), severity="warning", **values)
     is_robot = load_model(after, share).is_this_robot()
     rest = [] if is_robot else _reread(after, share, log)
     return [one, *rest] if is_robot or rest else []

@@ -61,12 +61,11 @@ def _far_origins(model: RobotModel) -> Iterator[Finding]:
     """Yield an error if joints are far beyond the bodies that carry them, as in millimetres."""
     J = pseudo_inertia(model.standard_parameters()[: model.layout.n_inertial])
     size = np.sqrt(np.trace(J[:, :3, :3], axis1=1, axis2=2) / np.maximum(J[:, 3, 3], TINY))  # RMS
-    carrier = np.array(model.pin_model.parents)
-    distance = np.array([np.linalg.norm(x.translation) for x in model.pin_model.jointPlacements])
-    is_far = (carrier > 0) & (distance > FARTHEST * size[carrier - 1]) & (size[carrier - 1] > 0.0)
-    for joint in np.array(model.pin_model.names)[is_far].tolist():
-        figures = {"distance": distance[model.pin_model.getJointId(joint)]}
-        yield finding("origin_units", "", joint, subject=f"joint {joint}", **figures)
+    engine = model.pin_model
+    for joint, i, place in zip(engine.names, engine.parents, engine.jointPlacements, strict=True):
+        distance = float(np.linalg.norm(place.translation))
+        if i > 0 and distance > FARTHEST * max(size[i - 1], np.median(size)) > 0.0:
+            yield finding("origin_units", "", joint, subject=f"joint {joint}", distance=distance)
 
 
 def explained_by_assumed(model: RobotModel, one: Finding) -> bool:

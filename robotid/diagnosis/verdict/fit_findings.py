@@ -18,7 +18,6 @@ from robotid.diagnosis.residual.misfit import Misfit, misfit_finding
 from robotid.diagnosis.urdf.inertials import DENSEST, audit_bodies
 from robotid.diagnosis.verdict.verdict import BEATEN, NAMED, SMALL, is_harmless_cost
 from robotid.estimation.estimators.consistent_fit import slabs
-from robotid.estimation.fitting.drive_terms import DriveChoice
 from robotid.estimation.fitting.estimator_settings import BoundedSettings, ConsistentSettings
 from robotid.estimation.fitting.fitted import CLEARLY, Fit, Identified
 from robotid.estimation.fitting.standard_errors import QUANTILE
@@ -118,13 +117,15 @@ def _of_static(fit: Fit) -> Finding:
 
 
 def _drive_findings(fit: Fit) -> Iterator[Finding]:
-    """Yield notes on friction shapes at their bounds, and on motion outside the fitted range."""
+    """Yield delays that were selected as terms, and notes on motion outside the fitted range."""
     for choice in fit.drives:
-        yield from _late(fit, choice)
-        for shape in choice.shapes:
-            if shape.is_at_bound:
-                words = {"name": shape.name, "unit": shape.unit}
-                yield finding("shape_at_bound", "", choice.joint, value=shape.value, **words)
+        selected = [one for one in choice.tried if one.is_selected]
+        for before, after in pairwise(selected):  # a late torque has the term -T d(tau)/dt
+            explained = before.held_out_error_pct**2 - after.held_out_error_pct**2
+            if after.families[-1] == "lag" and explained > (100 * decisions.DIFFERS) ** 2:
+                k = fit.model.layout.names.index(f"{choice.joint}.lag")
+                sizes = {"size": fit.standard[k], "std_error": fit.standard_error[k]}
+                yield finding("joint_delay", "", choice.joint, explained=False, **sizes)
         guards = {term.guards for term in choice.terms if np.isfinite(term.data_range).all()} - {""}
         j = fit.model.joints.index(choice.joint)
         for evaluation in fit.validation:
@@ -136,20 +137,8 @@ def _drive_findings(fit: Fit) -> Iterator[Finding]:
                 if share > decisions.SHARE_OF_ROWS:
                     yield finding(
                         "beyond_range", "", choice.joint, share_pct=100 * share, low=low, high=high,
-                        what={"q": "positions", "v": "speeds"}[key],
-                        name=evaluation.recording.name, families=listed(choice.families),
+                        what=key, name=evaluation.recording.name, families=listed(choice.families),
                     )  # fmt: skip
-
-
-def _late(fit: Fit, choice: DriveChoice) -> Iterator[Finding]:
-    """Yield the delay of a torque that was selected as a term, -T d(tau)/dt, and is too long."""
-    selected = [one for one in choice.tried if one.is_selected]
-    for before, after in pairwise(selected):
-        explained = before.held_out_error_pct**2 - after.held_out_error_pct**2
-        if after.families[-1] == "lag" and explained > (100 * decisions.DIFFERS) ** 2:
-            k = fit.model.layout.names.index(f"{choice.joint}.lag")
-            sizes = {"size": fit.standard[k], "std_error": fit.standard_error[k]}
-            yield finding("joint_delay", "", choice.joint, explained=False, **sizes)
 
 
 def correlated_findings(fit: Fit) -> Iterator[Finding]:
@@ -170,16 +159,8 @@ def correlated_findings(fit: Fit) -> Iterator[Finding]:
         )
         unit = "m/s" if joint in fit.model.layout.prismatic else "rad/s"
         yield finding(
-            "correlated_terms", "", joint, what="pair", pair=listed(single), sums=sums, unit=unit,
-            r=r,
+            "correlated_terms", "", joint, pair=listed(single), sums=sums, unit=unit, r=r
         )  # fmt: skip
-    for choice in fit.drives:
-        name = max(choice.grown, key=lambda name: choice.grown[name], default="")
-        if choice.joint not in joints and choice.grown.get(name, 1.0) > decisions.TENFOLD:
-            yield finding(
-                "correlated_terms", "", choice.joint, what="grown", name=name,
-                families=listed(choice.families), grown=choice.grown[name],
-            )  # fmt: skip
 
 
 def _correlations(C: Array, own: Sequence[int]) -> Array:
@@ -350,8 +331,6 @@ def _dense_bodies(fit: Fit) -> Iterator[Finding]:
         density = least_density(now)
         if density <= max(DENSEST, least_density(was)):
             continue
-        # at equal inertia the density is proportional to the mass to the power of 2.5
-        excess = float(now[0]) * (1.0 - (DENSEST / density) ** 0.4)
         rows = slice(10 * k, 10 * k + 10)
         covariance = fit.standard_covariance[rows, rows]
         share = density_share(now, covariance, DENSEST, np.random.default_rng(0))
@@ -360,18 +339,17 @@ def _dense_bodies(fit: Fit) -> Iterator[Finding]:
         yield finding(
             "dense_body", subject=f"link {body}", severity="note" if is_open else "warning",
             link=body, error=is_open, needs="finite" if is_finite else "none",
-            conclusion=is_open, cure=_cure(fit, body, excess), mass=now[0], density=density,
+            conclusion=is_open, cure=_cure(fit, body), mass=now[0], density=density,
             rounded=float(f"{density:.2g}") if is_finite else 0.0, densest=DENSEST,
             share=share, half_width=QUANTILE * np.sqrt(covariance[0, 0]),
         )  # fmt: skip
 
 
-def _cure(fit: Fit, body: str, excess: float = 0.0) -> str:
+def _cure(fit: Fit, body: str) -> str:
     """Return what to correct for an impossible body."""
     cure = "Record motion about more axes, or pin it to the URDF"
     for stated, mass in _stated_of(fit, body).items():
-        limit = f" (possible: up to about {mass - excess:.3g} kg)" * (excess > 0)
-        cure = f"Check the given {stated} of {mass:.4g} kg{limit}: weigh it, or remove it"
+        cure = f"Check the given {stated} of {mass:.4g} kg: weigh it, or remove it"
     return cure
 
 

@@ -244,10 +244,8 @@ def test_a_drive_that_is_off_is_no_sign_of_its_torque(ur5, last, severity):
 
 def test_a_recording_that_is_fitted_twice_is_named(ur5, short):
     again = replace(short, path="again.csv", t=short.t + 3.0)
-    (found,) = [
-        f for f in diagnose(ur5, [short, clean_log(ur5, 1, duration=5.0), again], [], SIGNALS)
-        if f.code == "repeated_log"
-    ]  # fmt: skip
+    findings = diagnose(ur5, [short, clean_log(ur5, 1, duration=5.0), again], [], SIGNALS)
+    (found,) = [f for f in findings if f.code == "repeated_log"]
     assert (found.where, found.severity) == ("again.csv", "warning")
     assert f"the same recording as {short.name}" in found.message
 
@@ -262,10 +260,8 @@ def whole(recordings, monkeypatch, name, *files):
 
 
 def test_ur10e_carries_a_load_and_moves_one_joint_at_a_time(recordings, monkeypatch):
-    job = whole(
-        recordings, monkeypatch, "ur10e", "ident_20200219_14harm_load", "ident_20200219_14harm"
-    )
-    findings = examine(job)
+    files = "ident_20200219_14harm_load", "ident_20200219_14harm"
+    findings = examine(whole(recordings, monkeypatch, "ur10e", *files))
     payload = {f.where.split(":")[0]: f for f in findings if f.code == "payload"}
     loaded = payload["ident_20200219_14harm_load.parquet"]
     assert loaded.severity == "warning"
@@ -358,8 +354,7 @@ def test_a_clean_log_of_a_small_arm_at_30_hertz_raises_no_alarm(name):
     # no tool of 1.2 kg: these arms would rightly be said to carry a load
     share = rng.uniform(0.8, 1.2, size // 10)
     pi[:size] = (model.standard_parameters()[:size].reshape(-1, 10) * share[:, None]).ravel()
-    motion = random_fourier(model, rng, period=10.0)
-    sensors = Sensors(noise=NOISE)
+    motion, sensors = random_fourier(model, rng, period=10.0), Sensors(noise=NOISE)
     log = perfect(model, pi, motion, rng, rate=30.0, duration=20.0, sensors=sensors)
     found = diagnose(model, [log], [], SignalSettings())
     assert [f.code for f in found if f.severity != "note"] == []

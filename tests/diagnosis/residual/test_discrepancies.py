@@ -176,9 +176,8 @@ def named(findings):
     return [(finding.code, finding.where) for finding in findings]
 
 
-@pytest.mark.parametrize(
-    ("offset", "size", "rate"), [(0.1, 1.0, 50.0), (0.03, 3.0, 100.0)]
-)  # what explains more
+# what explains more
+@pytest.mark.parametrize(("offset", "size", "rate"), [(0.1, 1.0, 50.0), (0.03, 3.0, 100.0)])
 def test_a_spring_is_named_beside_a_zero_that_is_off(model, offset, size, rate):
     how = {"effect": "spring", "size": size, "rate": rate}
     alone, (spring,), others = both(model, model, 3, 2, offset, **how)
@@ -284,15 +283,11 @@ def test_a_constant_force_on_the_flange_is_named_with_its_size(model):
     assert "changes in time" not in first.message
 
 
-def pushed(t):
-    return 25.0 * np.sin([2.1 * t, 1.7 * t + 1.0, 1.3 * t + 2.0])
-
-
 @pytest.mark.parametrize(
-    ("force", "gravity", "code"),
+    ("code", "force", "gravity"),
     [
-        (pushed, lambda t: 0.0, "external_force"),
-        (lambda t: np.zeros(3), lambda t: 0.4 * np.sin(0.3 * t), "moving_gravity"),
+        ("external_force", lambda t: 25 * np.sin(np.r_[2, 1.7, 1.3] * t + range(3)), np.zeros_like),
+        ("moving_gravity", lambda t: np.zeros(3), lambda t: 0.4 * np.sin(0.3 * t)),
     ],
 )
 def test_a_force_or_gravity_that_changes_in_time_is_the_only_finding(model, force, gravity, code):
