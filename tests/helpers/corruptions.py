@@ -92,6 +92,11 @@ def late(prefix, delay):
     return column(prefix, lambda x, t: np.interp(t - delay, t, x))
 
 
+def delayed(log, delay, joint=""):
+    table = late(f"tau_{joint}", delay)(table_of(log))
+    return replace(log, tau=np.column_stack([table[f"tau_{joint}"] for joint in log.joints]))
+
+
 def without(name):
     return lambda table: {key: values for key, values in table.items() if key != name}
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.diagnosis.decisions import EXACT, ZERO
+from robotid.diagnosis.decisions import EXACT, TENFOLD, ZERO
 from robotid.diagnosis.logs.probe import Probe, drive_columns
 from robotid.dynamics.constraint_rows import constraint_jacobian, force_basis, without_forces
 from robotid.dynamics.rows import inertial_rows, joint_constants
@@ -306,6 +306,7 @@ class Reading:
         curvature, weight = 0.5 * (high + low) - before, 1.0 / (before + EXACT)
         least = weight @ curvature
         x = float(-0.5 * (weight @ slope) / least if least > 0.0 else -np.sign(weight @ slope))
+        x = float(np.clip(x, -TENFOLD, TENFOLD))  # a parabola holds near its three points
         lowest = np.maximum(before + slope * x + curvature * x**2, 0.0)
         if misfit(before) - misfit(lowest) > _ALIKE:
             yield replace(self, values=(self.step * x,))

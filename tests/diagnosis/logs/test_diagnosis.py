@@ -12,7 +12,7 @@ from helpers.corruptions import CASES, NOISE, ROBOTS, clean_log, controlled_log,
 from helpers.driven import arm
 from helpers.synthetic import exact_log, perfect, truth
 
-from robotid.base.findings import grouped
+from robotid.base.findings import Finding, grouped
 from robotid.cli import main
 from robotid.cli.doctor import doctor
 from robotid.cli.job import Job, LogEntry, read_job
@@ -21,6 +21,7 @@ from robotid.data.files.read import write_columns, write_log
 from robotid.data.log import REPEATED, Log, Trajectory, repeated_share
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
+from robotid.diagnosis.explanations import explained
 from robotid.diagnosis.logs.check_logs import check_excitation, diagnose, findings_to_dict
 from robotid.diagnosis.urdf.inspection import inspect_urdf
 from robotid.dynamics.base_parameters import structural_mapping
@@ -247,10 +248,12 @@ def test_a_recording_that_is_fitted_twice_is_named(ur5, short):
 def test_an_origin_in_millimetres_is_the_only_cause(short, tmp_path):
     text = Path(URDF).read_text().replace("0.0 -0.1197 0.425", "0.0 -119.7 425")
     (tmp_path / "mm.urdf").write_text(text)
-    findings = diagnose(RobotModel.from_urdf(tmp_path / "mm.urdf"), [short], [], SIGNALS)
-    (found,) = [f for f in findings if f.severity != "note"]
+    model = RobotModel.from_urdf(tmp_path / "mm.urdf")
+    (found,) = (f for f in diagnose(model, [short], [], SIGNALS) if f.severity != "note")
     assert (found.code, found.severity) == ("origin_units", "error")
     assert found.joints == ("elbow_joint",)
+    spring = Finding("spring", "warning", "elbow_joint", "", joints=found.joints)  # of a fit
+    assert [x.severity for x in explained([found, spring], model)] == ["error", "note"]
 
 
 # ---- the recordings of other laboratories

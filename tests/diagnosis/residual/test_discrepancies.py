@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.corruptions import delayed
 from helpers.misfits import EFFECTS, log_with
 from helpers.paths import ROOT
 
@@ -233,15 +234,8 @@ def test_a_joint_axis_of_another_direction_is_named(model, tmp_path, joint, key,
     assert "its axis is tilted by" in first.message
 
 
-def late(log, delay, joint=2):
-    """Return the log with one torque late."""
-    tau = log.tau.copy()
-    tau[:, joint] = np.interp(log.t - delay, log.t, tau[:, joint])
-    return replace(log, tau=tau)
-
-
 def test_the_delay_of_one_torque_is_named(model):
-    (first,) = found(model, lambda log: late(log, 0.02))
+    (first,) = found(model, lambda log: delayed(log, 0.02, "elbow"))
     assert (first.code, first.where) == ("joint_delay", "elbow_joint")
     assert first.evidence["size"] == pytest.approx(0.02, rel=0.25)
 
@@ -249,7 +243,7 @@ def test_the_delay_of_one_torque_is_named(model):
 @pytest.mark.parametrize("delay", [0.0, 0.06])
 def test_a_delay_that_was_selected_as_a_drive_term_is_named(four, delay):
     plain = [log_with(four, 3, part=part, rate=50.0, duration=10.0) for part in (0, 1)]
-    logs = [late(log, delay, joint=0) for log in plain]
+    logs = [delayed(log, delay, "shoulder_pan") for log in plain]
     found = fit_findings(fitted(four, logs, families=dict.fromkeys(four.joints)))
     sizes = [one.evidence["size"] for one in found if one.code == "joint_delay"]
     assert sizes == pytest.approx([delay] * bool(delay), rel=0.25)
