@@ -1,6 +1,6 @@
 """identify_loops(): closed-loop identification from command logs, its result and its findings."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -358,14 +358,13 @@ def loop_findings(
     result: PositionIdentification, examined: Sequence[Finding]
 ) -> tuple[Finding, ...]:
     """Return the findings of logs and fit, the most severe first."""
-    # A cause that the logs show explains what the fit finds of its joints, an error all of it.
+    # Bodies connect the joints: a cause that the logs show explains what the fit finds of others.
     settled, found = [_settled_delay(one, result) for one in examined], list[Finding]()
     causes = [one for one in settled if one.code in codes_with("names_cause")]
     causes += _limits_found(result)
-    known = {joint for one in causes for joint in one.joints}
-    if result.has_gains and all(one.severity != "error" for one in causes):
+    if result.has_gains and all(one.severity == "note" for one in causes):
         with suppress(NotConvergedError, DataError):  # a log that cannot be simulated, or is short
-            found.extend(_other_gains(result, known))
+            found.extend(_other_gains(result))
         found.extend([] if causes or found else _valid_bands(result))
     of_fit = _of_fit(result, is_explained=bool(causes or found))
     return by_severity([*settled, *of_fit, *found])
@@ -482,7 +481,7 @@ def _unequal_gains(result: PositionIdentification) -> Iterator[Finding]:
             yield finding("unequal_gains", "", names, **ends, group=group)
 
 
-def _other_gains(result: PositionIdentification, known: Collection[str]) -> Iterator[Finding]:
+def _other_gains(result: PositionIdentification) -> Iterator[Finding]:
     """Yield logs with other gains than the fit, of joints whose simulated positions are wrong."""
     errors, fit = np.max([_relative_errors(run) for run in result.fitted], axis=0), result.fit
     loops, runs, others, least = fit.loops, result.validation, "the fit", errors / BETTER
@@ -491,8 +490,7 @@ def _other_gains(result: PositionIdentification, known: Collection[str]) -> Iter
         loops, others, least = fit_one_log(fit, first.log), first.log.name, 0.0 * errors
         runs = (*rest, *runs)
     for run in runs:
-        is_wrong = _relative_errors(run) > np.maximum(least, GOOD_POSITION)
-        joints = np.flatnonzero(is_wrong & ~np.isin(result.model.joints, [*known]))
+        joints = np.flatnonzero(_relative_errors(run) > np.maximum(least, GOOD_POSITION))
         found: dict[int, dict[str, float]] = {}
         for j, figures in fit_gains(fit.simulator, loops, run.log, joints).items():
             # the motion with a missing friction term may have a gain that differs by some 30 %
