@@ -2,19 +2,20 @@
 
     ROBOTID_DATA=folder python benchmarks/bench_commands.py [--quick] [--out FOLDER]
         [--go2] [--so101] [--arms] [--rollouts] [--coverage RUNS [--with-torque] [--driven]]
-        [--held RUNS [--bits BITS]]
+        [--held RUNS [--bits BITS ...]]
 
 Without a part named, roll-outs and 20 runs of coverage. --go2: fitted to the first 14.09 s of a
 chirp of twelve joints, beside mujoco.sysid on the same bodies, which starts its roll-out of the
 rest from the same position and speed. --so101: fitted to three motions of six servos, beside the
 plain baseline of the recording's description. --arms: recordings without commands, whose torque
-drives the robot: torque rows alone, roll-outs alone, both, each with viscous and Coulomb friction
+drives the robot: torque rows alone, simulations alone, both, each with viscous and Coulomb friction
 and offset; and the last with what friction other windows confirm. The simulated arm is MuJoCo's,
 16 kHz, written at 100 Hz, its torque with noise of 1 % of its size, encoders of 0.05 mrad.
---coverage: MuJoCo simulates a robot with known
-drives on a multi-sine of 10 s at 500 Hz, at a step of 0.05 ms and with stiff friction, encoders
-with noise of 0.3 mrad; gains are stated, bodies are those of the URDF. --driven: again without
-commands, the torque drives: logs as of the simulated arm at 250 Hz, the noise 5 %.
+--coverage: MuJoCo simulates a robot with known drives on a multi-sine of 10 s at 500 Hz, at a step
+of 0.05 ms and with stiff friction, encoders with noise of 0.3 mrad; gains are stated, bodies are
+those of the URDF. --with-torque instead: nothing is stated, bodies differ from the URDF, without
+and with logged torques. --driven: again without commands, the torque drives: logs as of the
+simulated arm at 250 Hz, the noise 5 %.
 --held: the planar arm and the leg, a plant of 0.1 ms with commands held for 4 ms, logged at 250 Hz,
 positions rounded to the steps of an encoder, one delay of the robot. Times are of the processor,
 all threads together, where they do not say otherwise: other loads of the machine add little.
@@ -23,6 +24,7 @@ all threads together, where they do not say otherwise: other loads of the machin
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
 
 import argparse
+import itertools
 import json
 import os
 import sys
@@ -108,7 +110,9 @@ def main():
         "--robots", nargs="+", default=["planar", "leg", "arm"], help="for --coverage"
     )
     parser.add_argument(
-        "--with-torque", action="store_true", help="for --coverage, also with logged torques"
+        "--with-torque",
+        action="store_true",
+        help="for --coverage, all unknown, without and with torques",
     )
     parser.add_argument(
         "--driven", action="store_true", help="for --coverage, also with the logged torque as input"
@@ -117,7 +121,7 @@ def main():
         "--held", type=int, metavar="RUNS", help="coverage for commands with a zero-order hold"
     )
     parser.add_argument(
-        "--bits", type=int, default=14, help="bits per revolution of the encoders, for --held"
+        "--bits", type=int, nargs="+", default=[14], help="bits of the encoders, for --held"
     )
     parser.add_argument(
         "--sysid-steps", type=int, default=30, help="maximum number of steps; 0: as published"
@@ -128,7 +132,7 @@ def main():
         "go2": options.go2 and (lambda: go2(options.sysid_steps)),
         "so101": options.so101 and so101,
         "arms": options.arms and arms,
-        "rollouts": options.rollouts and (lambda: rollouts(0.3 if options.quick else 3.0)),
+        "rollouts": options.rollouts and (lambda: rollouts(0.3 if options.quick else 10.0)),
         "coverage": options.coverage
         and (
             lambda: coverage(
@@ -145,7 +149,7 @@ def main():
     }  # fmt: skip
     if not any(parts.values()):
         runs = (["planar"], 2, 4.0) if options.quick else (options.robots, 20)
-        parts["rollouts"] = lambda: rollouts(0.3 if options.quick else 3.0)
+        parts["rollouts"] = lambda: rollouts(0.3 if options.quick else 10.0)
         parts["coverage"] = lambda: coverage(*runs)
     results = {name: part() for name, part in parts.items() if part}
     print(f"{setting.machine()}, mujoco {mujoco.__version__}")
@@ -396,8 +400,8 @@ def arm_rows(name, model, logs, kept, signals, truth=None):
     loop, rows, initialised = LoopSettings(kind="torque"), {}, time.process_time()
     linear = identify(model, logs, signals=signals, friction="none", doctor=False)
     took = time.process_time() - initialised
-    ways = {"roll-outs alone": (False, False), "both": (True, False),
-            "both, friction chosen": (True, True)}  # fmt: skip
+    ways = {"simulations alone": (False, False), "both": (True, False),
+            "both, friction selected": (True, True)}  # fmt: skip
     for way, (torques, chooses) in ways.items():
         initialised = time.process_time()
         settings = SimulationSettings(torques=torques)
@@ -413,7 +417,7 @@ def arm_rows(name, model, logs, kept, signals, truth=None):
         rows["the truth"] = (torque_mismatch(model, truth, kept, signals), position, 0.0)
     initialised = time.process_time()
     linear = identify(model, logs, signals=signals, doctor=False)
-    rows["torque rows alone, friction chosen"] = (
+    rows["torque rows alone, friction selected"] = (
         torque_mismatch(linear.model, linear.standard, kept, signals),
         driven_error(linear.model, linear.standard, kept[0], signals),
         time.process_time() - initialised,
@@ -465,8 +469,8 @@ def rollouts(seconds):
               f"{row['ours'][0] / row['mujoco'][0]:.1f} | {row['gradient']:.1f} | "
               f"{row['parameters']} |", flush=True)  # fmt: skip
     print(
-        "\nA roll-out is of one second of the robot, a step of 1 ms; of one thread by its "
-        "processor time, of two by the wall. The gradient is by all parameters at once.\n"
+        "\nEach simulation is of 1 s with steps of 1 ms; one thread: processor time, two threads: "
+        "wall-clock time. The gradient is by all parameters together.\n"
     )
     return rows
 
@@ -499,8 +503,8 @@ def rollout_row(name, plant, seconds):
     best = {way: np.full(2, np.inf) for way in ways}
     for way in ways.values():
         way()  # what is compiled is ready then
-    initialised = time.perf_counter()
-    while time.perf_counter() - initialised < seconds or not np.isfinite(best["mujoco 2"]).all():
+    initialised = time.process_time()
+    while time.process_time() - initialised < seconds or not np.isfinite(best["mujoco 2"]).all():
         for key, way in ways.items():  # in turn, so that all meet the same load
             start = clocks()
             way()
@@ -526,23 +530,24 @@ def drive_pi(plant):
 
 
 def coverage(
-    robots, runs, seconds=DURATION, *, with_torque=False, driven=False, bits=None
+    robots, runs, seconds=DURATION, *, with_torque=False, driven=False, bits=(None,)
 ):  # fmt: skip
     """Print the coverage of intervals, by robot and kind of parameter; return the rows."""
     print(f"| robot, {runs} runs | parameter | values | mean error / scatter | stated error / "
-          "scatter | 95 % interval coverage | stated / without torque "
+          "scatter | 95 % interval coverage | stated error / without torque "
           "| error / without torque |")  # fmt: skip
     print("|---" * 8 + "|")
     rows = []
-    for name in robots:
-        how = {} if bits is None else {"run": held_run, "bits": bits}
-        label = name if bits is None else f"{name}, {bits} bits"
-        rows += coverage_rows(label, covered(name, runs, seconds, **how))
-        if with_torque:
+    for name, bit in itertools.product(robots, bits):
+        how = {} if bit is None else {"run": held_run, "bits": bit}
+        label = name if bit is None else f"{name}, {bit} bits"
+        if not with_torque:
+            rows += coverage_rows(label, covered(name, runs, seconds, **how))
+        else:
             alone = covered(name, runs, seconds, finds_all=True)
-            rows += coverage_rows(f"{name}, all found", alone)
+            rows += coverage_rows(f"{name}, all unknown", alone)
             both = covered(name, runs, seconds, finds_all=True, torque=True)
-            rows += coverage_rows(f"{name}, all found, torque", both, alone)
+            rows += coverage_rows(f"{name}, all unknown, torque", both, alone)
         if driven:
             for way, found in driven_errors(name, runs, seconds).items():
                 rows += coverage_rows(f"{name}, driven, {way}", found)
@@ -564,7 +569,7 @@ def covered(name, runs, seconds, run=None, **how):
 
 def driven_errors(name, runs, seconds):
     """Return the same of a robot that its torque drives, by what it was fitted to."""
-    ways = {"roll-outs alone": {"torques": False}, "both": {"torques": True}}
+    ways = {"simulations alone": {"torques": False}, "both": {"torques": True}}
     errors = {way: {} for way in ("torque rows alone", *ways)}
     for seed in range(runs):
         rng = np.random.default_rng([18, seed])

@@ -7,7 +7,7 @@ Panda (arm) and UR10, 10 s, 5 harmonics, position, velocity and torque limits of
 eigenvalues of the base problem's information, the smaller the better; 0.1 less are intervals 5 %
 narrower. Every motion that is counted keeps all limits on the grid of its design; those of
 "design" are scaled until they keep them on a grid 15 times finer. How fast one start settles is
-measured by ``bench_designs.py``. SLSQP has the same start,
+measured by ``bench_designs.py``. All times are of the processor. SLSQP has the same start,
 objective and grid, gradients by differences, and the limits at every fifth instant; each of its
 iterates is then scaled until it keeps the limits, as a random motion is, and the best counts.
 
@@ -24,6 +24,7 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import scipy.optimize
@@ -105,8 +106,8 @@ def robot_row(folder, name, joints, seconds):
     code, said = run(
         "excite", *robot, "--out", motion, "--json", "--starts", 1, "--seconds", seconds
     )
-    if code and "states no limit" in said:
-        return f"| {name} | told which limits its URDF lacks |" + " -- |" * 5
+    if code and "has no limit of" in said:
+        return f"| {name} | its URDF lacks limits |" + " -- |" * 5
     if code:
         raise SystemExit(f"{name}: {said}")
     design = json.loads(said)
@@ -210,13 +211,14 @@ def main():
     cases = CASES[1:] if options.quick else CASES
     budgets, count = ((1,), 10) if options.quick else ((1, 10, 60), 500)
     tasks = {name: designer(name) for name in cases}
-    print("| robot | after | design (selected) | SLSQP | best random |")
+    print("| robot | after | design (time) | SLSQP | best random |")
     print("|---" * 5 + "|")
-    for name, task in tasks.items():
-        against_time(name, task, budgets, count)
-    if options.robots:
-        print()
-        all_robots(1 if options.quick else 10, list(ROBOTS)[-2:] if options.quick else ROBOTS)
+    with mock.patch.object(time, "monotonic", time.process_time):
+        for name, task in tasks.items():
+            against_time(name, task, budgets, count)
+        if options.robots:
+            print()
+            all_robots(1 if options.quick else 10, list(ROBOTS)[-2:] if options.quick else ROBOTS)
     print(f"\n{setting.machine()}")
 
 

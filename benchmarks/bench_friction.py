@@ -59,7 +59,7 @@ def main():
     options = parser.parse_args()
     if "ROBOTID_DATA" in os.environ:
         real_recordings(
-            ["kinova_gen3"] if options.quick else sorted(p.stem for p in JOBS.iterdir())
+            ["kinova_gen3"] if options.quick else sorted(p.stem for p in JOBS.glob("*.toml"))
         )
     else:
         print("no recordings: set ROBOTID_DATA\n")
@@ -70,7 +70,7 @@ def main():
 
 
 def real_recordings(names):
-    print("| validation of | joint | RMSE, viscous and Coulomb | RMSE, auto | ratio | chosen |")
+    print("| recording | joint | RMSE, viscous and Coulomb | RMSE, auto | ratio | selected |")
     print("|---|---|---|---|---|---|")
     for name in names:
         job = read_job(JOBS / f"{name}.toml")
@@ -165,8 +165,8 @@ def coverage(recordings, estimator, signals):
     ]
     print(f"| all parameters | {' | '.join(f'{100 * np.mean(x):.1f} %' for x in sums)} |")
     joints = recordings * len(TRUTH)
-    print(f"| the truth's family is chosen | {right} of {joints} joints | |")
-    print(f"| a family is chosen where there is none | {beside} of {joints} joints | |")
+    print(f"| the true term is selected | {right} of {joints} joints | |")
+    print(f"| a term is selected where there is none | {beside} of {joints} joints | |")
     print(f"| a misfit is named on the joint | | {named} of {joints} joints |", flush=True)
 
 

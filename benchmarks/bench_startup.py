@@ -1,20 +1,20 @@
 """Start-up in fresh processes: imports, the command line's help, first uses of the compiled path.
 
-Each line is run in processes of its own, in turn, so that all meet the same load; the median
-counts. "over bare Python" takes the time of an empty program off. The compiled path is used first
-with an empty cache of compiled code (it compiles, once per installation), then first in a process
-(it reads that code), then again in the same process.
+Each line is run in processes of its own, in turn, so that all meet the same load; the median of
+the processor's time counts. "over bare Python" takes the time of an empty program off. The compiled
+path is used first with an empty cache of compiled code (it compiles, once per installation), then
+first in a process (it reads that code), then again in the same process.
 
     python benchmarks/bench_startup.py [--quick]
 """
 
 import argparse
 import os
+import resource
 import statistics
 import subprocess
 import sys
 import tempfile
-import time
 
 from setting import machine
 
@@ -39,9 +39,9 @@ x = np.ones((64, 6))
 log = Trajectory(t=np.arange(64.0), q=x, v=x, a=x, tau=x, joints=model.joints, rate=1.0,
                  segment=np.zeros(64, dtype=int))
 for _ in range(2):
-    start = time.perf_counter()
+    start = time.process_time()
     compress(build_problem(model, log, compiled={compiled}))
-    print(time.perf_counter() - start)
+    print(time.process_time() - start)
 """
 
 
@@ -62,18 +62,19 @@ def main():
         for name, compiled in (("Pinocchio", False), first, later):
             first, second = first_uses(compiled, folder)
             print(f"{name}: {first:.3f} s, then {second * 1e3:.2f} ms")
-    print(f"\nwall-clock time; {machine()}")
+    print(f"\nprocessor time; {machine()}")
 
 
 def in_turn(programs, repeats):
-    """Return the median time of each program [s], after one run that fills the caches."""
+    """Return the median processor time of each program [s], after one run that fills the caches."""
     seconds = [[] for _ in programs]
     for k in range(repeats + 1):
         for own, arguments in zip(seconds, programs, strict=True):
-            start = time.perf_counter()
+            before = resource.getrusage(resource.RUSAGE_CHILDREN)
             subprocess.run([sys.executable, *arguments], check=True, stdout=subprocess.DEVNULL)
+            after = resource.getrusage(resource.RUSAGE_CHILDREN)
             if k:
-                own.append(time.perf_counter() - start)
+                own.append(sum(after[:2]) - sum(before[:2]))  # of the user and of the system
     return [statistics.median(own) for own in seconds]
 
 

@@ -16,7 +16,7 @@ log, torques by Pinocchio's RNEA and drives with viscous and Coulomb friction, w
 A motion of its own in each run, of 24 s, or of 12 s that is run twice: rounding errors repeat.
 Counted are inertial base parameters; "shift" is the largest correction in standard errors, the
 median over the runs, "named" in how many runs there is a finding ``encoder_noise``. With
-``--uncorrected`` the noise of the regressor is left as it is, to compare.
+``--uncorrected`` the coarsest encoders come again, the noise of the regressor left as it is.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
@@ -98,7 +98,7 @@ class Study:
             log = Log(
                 t=t, q=q, tau=tau + noise(kind, tau, draw), joints=self.model.joints, v=v, a=a
             )
-            identification = identify(self.model, [log], signals=CHAINS[chain])
+            identification = identify(self.model, [log], signals=CHAINS[chain], doctor=False)
             truth = self.mapping.to_base(pi)
             reach = identification.errors.quantile
             wls, consistent = identification.wls, identification
@@ -196,13 +196,16 @@ def print_encoders(robots, frictions, bits, runs):
     print(f"{runs} runs each; inertial base parameters; torque noise {100 * ENCODER_NOISE:g} %")
     print("| robot | bits | motion | friction | estimator | coverage | RMS z | shift | named |")
     print("|---" * 9 + "|")
-    for name, period, friction, bit in itertools.product(
+    correction = fit.find_regressor_noise
+    for name, period, friction, (bit, is_corrected) in itertools.product(
         robots, (DURATION, DURATION / 2), frictions, bits
     ):
+        fit.find_regressor_noise = correction if is_corrected else lambda *_: None
         study = EncoderStudy(name, bit, period, friction, runs)
         motion = "once" if period == DURATION else "twice"
+        encoder = f"{bit}{'' if is_corrected else ', not corrected'}"
         for key in study.z:
-            row = f"| {name} | {bit} | {motion} | {friction} | {key} | {study.row(key)} |"
+            row = f"| {name} | {encoder} | {motion} | {friction} | {key} | {study.row(key)} |"
             print(row, flush=True)
 
 
@@ -212,21 +215,19 @@ def main():
     parser.add_argument("--robots", nargs="+")
     parser.add_argument("--quick", action="store_true", help="few runs of one robot, as a trial")
     parser.add_argument("--encoders", action="store_true", help="encoders of 12, 14 and 18 bits")
-    parser.add_argument(
-        "--uncorrected", action="store_true", help="encoders without the correction"
-    )
+    parser.add_argument("--uncorrected", action="store_true", help="also without the correction")
     parser.add_argument("--bits", type=int, nargs="+", default=[12, 14, 18])
     parser.add_argument("--friction", nargs="+", default=["viscous+coulomb", "auto"])
     options = parser.parse_args()
     if options.encoders:
         print(setting.machine())
-        if options.uncorrected:
-            fit.find_regressor_noise = lambda *_: None
+        bits = [(bits, True) for bits in options.bits]
+        bits += [(min(options.bits), False)] if options.uncorrected else []
         if options.quick:
-            print_encoders(["UR5"], options.friction[:1], options.bits, 2)
+            print_encoders(["UR5"], options.friction[:1], bits, 2)
         else:
             robots = options.robots or ["UR5", "panda"]
-            print_encoders(robots, options.friction, options.bits, options.runs)
+            print_encoders(robots, options.friction, bits, options.runs)
         return
     robots, runs = (
         (["UR10"], 2) if options.quick else (options.robots or ["UR10", "panda"], options.runs)

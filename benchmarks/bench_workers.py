@@ -11,7 +11,6 @@ line. The shortest of the runs counts, in wall-clock time: other work on the mac
 """
 
 import argparse
-import os
 import subprocess
 import sys
 import tempfile
@@ -63,7 +62,7 @@ def main():
                 sys.exit(f"{workers} workers gave other bits")
     print(
         f"\n{rows:,} rows in {len(pieces)} pieces. With start: workers start anew. Running: they "
-        f"are there. {machine()}, load {os.getloadavg()[0]:.1f}"
+        f"are there. {machine()}"
     )
 
 

@@ -129,7 +129,7 @@ def peak_memory(function):
 
 
 def machine():
-    """Return versions, cores and threads in one line."""
+    """Return versions, cores, threads and mean load of the last 15 minutes in one line."""
     parts = [f"Python {platform.python_version()}"]
     for name in ("pin", "numpy", "scipy", "numba"):
         try:
@@ -138,5 +138,5 @@ def machine():
             parts.append(f"no {name}")
     return (
         ", ".join(parts) + f", {platform.machine()}, {os.cpu_count()} cores, "
-        f"BLAS threads {os.environ['OPENBLAS_NUM_THREADS']}"
+        f"BLAS threads {os.environ['OPENBLAS_NUM_THREADS']}, load {os.getloadavg()[2]:.1f}"
     )

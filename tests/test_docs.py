@@ -149,14 +149,14 @@ def test_the_page_on_simulation_says_what_the_settings_say_and_runs(tmp_path, mo
 def follow(tmp_path, monkeypatch, capsys):
     """Do what a page says, block by block, as a user in an empty folder; return what it printed.
 
-    Trajectories are designed with a shorter search, so figures may differ from those of the page.
+    Trajectories are designed with a brief search, so figures may differ from those of the page.
     """
     monkeypatch.chdir(tmp_path)
     leave_out_meshes(monkeypatch)
     paths = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
     saved = re.compile(r"[Ss]ave (?:this|it) as `([\w.]+)`")
 
-    def follow(page, seconds=0.5):
+    def follow(page, brief="--seconds 0.5"):
         text, end, printed, namespace = (DOCS / page).read_text(), 0, "", {}
         found = list(re.finditer(r"^ *```(\w+)\n(.*?)^ *```$", text, re.DOTALL | re.MULTILINE))
         for at, nearest in zip(found, [*found[1:], None], strict=True):
@@ -169,8 +169,8 @@ def follow(tmp_path, monkeypatch, capsys):
             is_error = bool(nearest) and nearest[2].lstrip().startswith("error:")
             for line in as_lines(block) if language == "bash" else ():
                 if line.startswith("robotid "):
-                    brief = f"excite --starts 1 --seconds {seconds} --points 20"
-                    words = shlex.split(line.replace("--starts 1 ", "").replace("excite", brief))
+                    search = f"excite --starts 1 --points 20 {brief}"
+                    words = shlex.split(line.replace("--starts 1 ", "").replace("excite", search))
                     assert (main(words[1:]) == 1) == is_error, line
                 else:
                     subprocess.run(["bash", "-ec", line], env=os.environ | paths, check=True)
@@ -224,7 +224,7 @@ def test_the_first_tutorial_runs_as_written(follow):
 
 
 def test_currents_and_a_gripper(follow):
-    printed = follow("tutorials/currents_and_gripper.md", seconds=60)  # until it has converged
+    printed = follow("tutorials/currents_and_gripper.md", "--seconds 60 --clearance none")
     assert re.findall("verdict: (.*)", printed) == ["good", "usable"]
     factors = re.search(r"much better if multiplied by (\S+) to (\S+):", printed).groups()
     assert [float(x) for x in factors] == pytest.approx([11.1 / 14.9] * 2, abs=0.02)

@@ -12,7 +12,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.cores import available_cores
+from robotid.base.exceptions import DataError, RobotIdError, SettingsError
 from robotid.base.files import (
     check_folder,
     dataset_of,
@@ -36,7 +37,6 @@ from robotid.cli.job import (
     stated_path,
 )
 from robotid.data.files.parquet_files import read_text_table, write_rows
-from robotid.dynamics.factors import available_cores
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.estimation.variation.groups import FEWEST_RUNS
 from robotid.estimation.variation.variation import FALSE_ALARMS, between_units
@@ -204,7 +204,7 @@ def identify_unit(unit: FleetUnit, threads: int | None) -> tuple[UnitRows, str]:
         used = [e.path for e in job.identification if e.path not in refused]
         rows += _rows(unit.unit, used, result)
         html = report_html(identification)
-    except Exception as error:  # the fleet goes on: the error is in the table, with its type
+    except Exception as error:  # the fleet goes on: the error is in the table
         rows = [_failure(unit, error)]
     rows += [
         {"unit": unit.unit, "log": str(path), "status": "failed", "error": error}
@@ -214,7 +214,8 @@ def identify_unit(unit: FleetUnit, threads: int | None) -> tuple[UnitRows, str]:
 
 
 def _failure(unit: FleetUnit, error: Exception) -> dict[str, Any]:
-    text = "; ".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", [])])
+    kind = "" if isinstance(error, RobotIdError) else f"{type(error).__name__}: "
+    text = "; ".join([f"{kind}{error}", *getattr(error, "__notes__", [])])
     return {"unit": unit.unit, "status": "failed", "error": text}
 
 

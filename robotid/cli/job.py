@@ -156,7 +156,7 @@ class Job(Settings):
         "independent", "independent, or coupled: a mimic joint moves with its leader"
     )
     snap_angles: bool = setting(
-        False, "whether rounded angles of the URDF's joints, as 3.1416, are replaced by the "
+        False, "whether rounded angles of the URDF's joints, such as 3.1416, are replaced by the "
         "nearest multiple of pi/12",
     )  # fmt: skip
     signals: SignalSettings = setting(SignalSettings(), "signal processing of the logs")
@@ -166,15 +166,14 @@ class Job(Settings):
     )  # fmt: skip
     model_dynamics: str = setting(
         "full",
-        "full; or static, for logs of poses and slow sweeps: velocities determine only the sign of "
-        "friction, accelerations are not used; gravity parameters (masses, first moments), Coulomb "
-        "friction and offsets are identified, the others have the URDF's values",
+        "full; or static, for logs of poses and slow sweeps: masses, first moments, Coulomb "
+        "friction and offsets are identified, the others keep the URDF's values",
         at="model.dynamics", among=DYNAMICS,
     )  # fmt: skip
     drives: Mapping[str, tuple[str | DriveTerm, ...]] = setting(
         {},
-        "further friction of single joints, by joint: names as of friction, whose shape is "
-        "identified, or a term with its shape, as { term = 'Harmonic', order = 101.0 }",
+        "further friction of single joints, by joint: names of friction terms, whose shape is "
+        "identified, or a term with its shape, such as { term = 'Harmonic', order = 101.0 }",
         reads=Entries(dict, (list,)), load=_load_drives, dump=_dump_drives,
     )  # fmt: skip
     gains: Mapping[str, float] = setting(
@@ -202,7 +201,7 @@ class Job(Settings):
     passive: tuple[str, ...] = setting(
         (),
         "joints without a drive: their torque is 0 and needs no column; positions that logs lack "
-        "are computed from the loops; no friction except that in [drives]",
+        "are computed from the loops; no friction except the terms in [drives]",
     )
     estimator: EstimatorSettings = setting(ConsistentSettings(), "estimator and its settings")
     controller: LoopSettings = setting(

@@ -27,13 +27,15 @@ def run(options: argparse.Namespace) -> None:
 
 def _show(result: dict[str, Any]) -> None:
     cases = {"disturbed": "disturbed", "noisy": "noisy", "on_program": "on program"}
-    print("relative error of the parameters; the last three columns at the last iteration")
+    print("relative error of the parameters; NA: first iteration with PRX = 0, - if there is none")
     print("  model       start   after 1   at end   " + "  ".join(cases.values()) + "   NA")
     for name, model in result["models"].items():
         errors = model["relative_error"]
         ends = [result[case][name]["relative_error"][-1] for case in cases]
         cells = [errors[0], errors[1], errors[-1], *ends]
-        print(f"  {name:10}" + "".join(f"{cell:9.2g}" for cell in cells) + f"   {model['NA']}")
+        print(
+            f"  {name:10}" + "".join(f"{cell:9.2g}" for cell in cells) + f"   {model['NA'] or '-'}"
+        )
     print("\nrandom motions that converged to 1e-3")
     for name, motions in result["trajectories"].items():
         print(f"  {name:10} {motions['converged']} of {motions['runs']}")

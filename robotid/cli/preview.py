@@ -101,8 +101,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("logs", nargs="*", metavar="MOTION", help="motions or logs; only positions are read")
     words = "result.json or its folder: the information of its logs is added; its noise is used"
     add("--given", metavar="RESULT", help=words)
-    words = "standard deviation of a joint's torque [N m or N]; repeatable; default: that "
-    words += "of RESULT, or 1 %% of the joint's largest torque"
+    words = "standard deviation of a joint's torque [N m or N]; repeatable; default: the "
+    words += "noise of RESULT, or 1 %% of the joint's largest torque"
     add("--noise", metavar="JOINT=N_M", action="append", default=[], help=words)
     words = "correlation time of the noise [s]; 0: uncorrelated samples; default: 0.1"
     add("--correlation", metavar="S", type=float, help=words)

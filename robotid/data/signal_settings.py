@@ -67,15 +67,14 @@ class SignalSettings(Settings):
     )
     velocity: str = setting(
         "auto",
-        "measured, differentiated (from the position), or auto: measured, if consistent with the "
-        "position, of sufficient resolution, and as good as differentiated in predicting the "
-        "torque of held-out segments",
+        "measured, differentiated (from the position), or auto: measured, if it agrees with the "
+        "position, has sufficient resolution, and predicts the torque of held-out segments as well",
         among=_MEASURED,
     )
     acceleration: str = setting(
         "auto",
         "measured, differentiated (from the velocity), or auto: measured, if the log has it and "
-        "the measured velocity is used",
+        "its velocity is used",
         among=_MEASURED,
     )
     trim: float = setting(
@@ -83,16 +82,15 @@ class SignalSettings(Settings):
     )
     min_velocity: float = setting(
         0.02,
-        "joint speed below which rows are not used to identify Coulomb friction and a drive may be "
-        "in stiction [rad/s]; a prismatic joint crosses its range (1 m if the URDF has none) in "
-        "the time of a full turn at this speed; 0 uses all rows",
+        "joint speed below which a drive may be in stiction, so that rows are not used to identify "
+        "Coulomb friction [rad/s]; the range of a prismatic joint (1 m if the URDF has none) "
+        "counts as a full turn; 0 uses all rows",
         within=NOT_NEGATIVE,
     )
     friction_band: float = setting(
         0.0,
-        "speed from which Coulomb friction has its full value [rad/s], of prismatic joints as for "
-        "min_velocity; it changes linearly between the two signs of this speed; 0: sign of the "
-        "speed, the Coulomb model",
+        "speed from which Coulomb friction has its full value [rad/s], for prismatic joints as in "
+        "min_velocity; at lower speed it is linear; 0: it has the sign of the speed",
         within=Range("0, or 1e-9 or more", lambda x: x == 0 or x >= 1e-9),
     )
     max_gap: float | None = setting(
@@ -103,11 +101,11 @@ class SignalSettings(Settings):
     )
     torque_delay: float = setting(
         0.0,
-        "delay of the logged torque relative to the position [s], which is corrected",
+        "delay of the logged torque relative to the position [s]; it is corrected",
         within=_DELAY,
     )
     velocity_delay: float = setting(
-        0.0, "delay of the measured velocity, likewise [s]", within=_DELAY
+        0.0, "delay of the measured velocity relative to the position [s]", within=_DELAY
     )
 
 
@@ -125,7 +123,7 @@ class LogUnits(Settings):
     )
     percent: Mapping[str, Sequence[float]] = setting(
         {}, "joints logged from 0 to 100, such as grippers of LeRobot: the positions at 0 and at "
-        "100 by joint [rad or m], as { gripper = [-0.17, 1.75] }",
+        "100 by joint [rad or m], such as { gripper = [-0.17, 1.75] }",
         reads=Entries(dict, (list,)),
     )  # fmt: skip
 
@@ -157,7 +155,7 @@ class LogSource(Settings):
     topic: str | None = setting(
         None,
         "the topic of a bag, the group or struct of an HDF5, MAT or NPZ file, or the episode of "
-        "a LeRobot dataset, as episode_3; not needed if there is only one",
+        "a LeRobot dataset, such as episode_3; not needed if there is only one",
     )
     command: str | None = setting(
         None,
@@ -180,9 +178,9 @@ class LogSource(Settings):
     )
     stamp: str = setting(
         "header",
-        "the time stamps: even, equal time steps for all rows, for a recorder that stamps rows of "
-        "one rate on arrival, in bunches; of a bag also header, the stamp in the message, or log, "
-        "the time of recording",
+        "source of the time stamps: even (equal steps, for a recorder that stamps bunches of rows "
+        "on arrival); for a bag also header (the stamp in the message) or log (the time of "
+        "recording)",
         among=("header", "log", "even"),
     )
     sensors: tuple[str, ...] = setting(
@@ -217,14 +215,14 @@ class BaseSource(Settings):
     )
     link: str | None = setting(
         None,
-        "the link whose pose base_x to base_qw are, as the chest of a human; default: the root "
-        "link. Velocities of another link are not read",
+        "the link whose pose base_x to base_qw are; default: the root link. Velocities of another "
+        "link are not read",
     )
     imu: str | None = setting(
         None,
         "the link of an IMU, fixed to the root link; its angular velocity and specific force, "
         "imu_wx to imu_az, are used instead of velocities and accelerations of the base, and its "
-        "orientation, imu_qx to imu_qw, if there is none of the base",
+        "orientation, imu_qx to imu_qw, if the base has none",
     )
 
 

@@ -1,6 +1,6 @@
 """Units and measured velocities of a log: stated, or checked against its positions."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import wraps
 from typing import TypeVar
 from weakref import WeakKeyDictionary
@@ -43,13 +43,13 @@ def check_units(
     """Reject a log whose numbers look like another unit than SI, unless the unit is given."""
     is_revolute = np.array([name not in prismatic for name in log.joints])
     factor = _velocity_factor(log)  # (n,), NaN for a joint that does not determine it
-    if units.time is None:
-        _check_step(float(np.median(np.diff(log.t))), float(log.t[0]), log.name)
-        _check_clock(log, factor)
-    if units.angle is None:
-        check_reach(log, units, prismatic, turning)
-        _check_degrees(log, np.where(is_revolute, factor, np.nan))
-        _check_commands(log, is_revolute)
+    mixed = _mixed_velocities(log, np.where(is_revolute, factor, np.nan))
+    time = [*_wrong_step(log), *_wrong_clock(log, factor)]
+    angle = [*_far_angles(log, is_revolute, turning), *mixed, *_mixed_commands(log, is_revolute)]
+    unstated = (time[:1] if units.time is None else []) + (angle[:1] if units.angle is None else [])
+    if unstated:  # one refusal for both units
+        words = ". ".join(str(error).removeprefix(f"{log.name}: ") for error in unstated)
+        raise DataError(f"{log.name}: {words}", code=unstated[0].code)
     for j in np.flatnonzero(_is_near(factor, -1.0)):
         raise DataError(
             f"{log.name}: dq_{log.joints[j]} has the opposite sign of d(q)/dt of "
@@ -58,27 +58,28 @@ def check_units(
         )
 
 
-def _check_step(step: float, start: float, where: str) -> None:
-    """Reject a median time step that is too long for seconds, and dates in other units."""
+def _wrong_step(log: Log) -> Iterator[DataError]:
+    """Yield a median time step that is too long for seconds, and dates in other units."""
+    step, start = float(np.median(np.diff(log.t))), float(log.t[0])
     epoch = [unit for unit in _TIME_NAMES if _EPOCHS[0] < start / PER_SECOND[unit] < _EPOCHS[1]]
     if not epoch and step <= _SLOWEST * (1 + 1e-6):
         return
     unit = epoch[0] if epoch else "ms" if step <= 1e2 else "us" if step <= 1e5 else "ns"
     since = f", the first time stamp {start:.13g} since 1970" if epoch else ""
-    raise DataError(
-        f"{where}: median step {step:.6g} looks like {_TIME_NAMES[unit]}{since} "
+    yield DataError(
+        f"{log.name}: median step {step:.6g} looks like {_TIME_NAMES[unit]}{since} "
         f"({PER_SECOND[unit] / step:.4g} Hz); in seconds it would be {1 / step:.3g} Hz. "
         f"{_how_to_state('time', unit, 's')}. To convert it, multiply by {1 / PER_SECOND[unit]:g}",
         code="time_unit",
     )
 
 
-def _check_clock(log: Log, factor: Array) -> None:
-    """Reject time stamps with which the measured velocity is wrong by a power of 1000."""
+def _wrong_clock(log: Log, factor: Array) -> Iterator[DataError]:
+    """Yield time stamps with which the measured velocity is wrong by a power of 1000."""
     for power, unit in ((1, "ms"), (2, "us"), (3, "ns"), (-1, "s"), (-2, "s"), (-3, "s")):
         for j in np.flatnonzero(_is_near(np.abs(factor), 1000.0**power)):
             looks = f"; the time looks like {_TIME_NAMES[unit]}" if power > 0 else ""
-            raise DataError(
+            yield DataError(
                 f"{log.name}: dq_{log.joints[j]} is {abs(factor[j]):.3g} times d(q)/dt{looks}. "
                 f"{_how_to_state('time', unit, 's')}",
                 code="time_unit",
@@ -89,9 +90,12 @@ def check_reach(
     log: Log, units: LogUnits, prismatic: Collection[str] = (), turning: Collection[str] = ()
 ) -> None:
     """Reject revolute joints with angles too large for radians, unless the unit is given."""
-    if units.angle is not None:
-        return
     is_revolute = np.array([name not in prismatic for name in log.joints])
+    for error in _far_angles(log, is_revolute, turning) if units.angle is None else ():
+        raise error
+
+
+def _far_angles(log: Log, is_revolute: Array, turning: Collection[str]) -> Iterator[DataError]:
     for kind, values in (("q", log.q), ("qref", log.q_ref)):
         if values is None:
             continue
@@ -102,7 +106,7 @@ def check_reach(
             how = _how_to_state("angle", "deg", "rad")
             if alone := _alone(log, kind, j, np.delete(largest, j)[np.delete(is_revolute, j)]):
                 how = f"{alone}. If all joints are in degrees, {how[0].lower()}{how[1:]}"
-            raise DataError(
+            yield DataError(
                 f"{log.name}: {kind}_{log.joints[j]} reaches {largest[j]:.4g}, which looks like "
                 f"degrees (in radians {largest[j] / (2 * np.pi):.1f} revolutions). {how}",
                 code="angle_unit",
@@ -139,8 +143,8 @@ def _alone(log: Log, kind: str, j: int, others: Array) -> str:
     )
 
 
-def _check_commands(log: Log, is_revolute: Array) -> None:
-    """Reject joints with only one of position and commanded position in degrees, of any sign."""
+def _mixed_commands(log: Log, is_revolute: Array) -> Iterator[DataError]:
+    """Yield joints with only one of position and commanded position in degrees, of any sign."""
     if log.q_ref is None:
         return
     q, wanted = log.q - log.q.mean(axis=0), log.q_ref - log.q_ref.mean(axis=0)
@@ -150,7 +154,7 @@ def _check_commands(log: Log, is_revolute: Array) -> None:
     factor = np.copysign(sizes[1], both) / np.where(follows, sizes[0], np.nan)
     ratio = np.abs(factor)
     for j in np.flatnonzero(_is_near(ratio, np.degrees(1.0)) | _is_near(ratio, np.radians(1.0))):
-        raise DataError(
+        yield DataError(
             f"{log.name}: the motion of qref_{log.joints[j]} is {factor[j]:.3g} times the "
             f"motion of q_{log.joints[j]}: one looks like degrees, the other like radians. "
             f"Convert one in the recording. {_how_to_state('angle', 'deg', 'rad', both=True)}",
@@ -158,11 +162,11 @@ def _check_commands(log: Log, is_revolute: Array) -> None:
         )
 
 
-def _check_degrees(log: Log, factor: Array) -> None:
-    """Reject joints with only one of position and velocity in degrees."""
+def _mixed_velocities(log: Log, factor: Array) -> Iterator[DataError]:
+    """Yield joints with only one of position and velocity in degrees."""
     for wrong, ratio in (("velocity", np.degrees(1.0)), ("position", np.radians(1.0))):
         for j in np.flatnonzero(_is_near(np.abs(factor), ratio)):
-            raise DataError(
+            yield DataError(
                 f"{log.name}: dq_{log.joints[j]} is {abs(factor[j]):.3g} times d(q)/dt: the "
                 f"{wrong} looks like degrees, the other like radians. Convert one of them in the "
                 f"recording. {_how_to_state('angle', 'deg', 'rad', both=True)}",

@@ -7,24 +7,20 @@ copies nothing and releases the interpreter's lock. Without it, SciPy's wrapper 
 """
 
 import ctypes
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from itertools import chain, pairwise
-from typing import TypeAlias, TypeVar
+from typing import TypeAlias
 
 import numpy as np
 import scipy.linalg.cython_lapack
 import scipy.linalg.lapack
 
+from robotid.base.cores import in_order
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
-
-ItemT = TypeVar("ItemT")
-ResultT = TypeVar("ResultT")
 
 _PART = 16384  # samples per part: merging costs little, and there are enough parts for threads
 PANEL = 8  # columns eliminated at a time: measured fastest for 20 to 70 columns ...
@@ -103,13 +99,10 @@ class Problem:
             for W, tau, weight in self.blocks():
                 yield W[:, columns], tau, weight
 
-        names, sources = tuple(self.names[i] for i in columns), self.sources
+        names = tuple(self.names[i] for i in columns)
+        sources = tuple(source.select(columns) for source in self.sources)
         return replace(
-            self,
-            stream=stream,
-            names=names,
-            support=self.support[:, columns],
-            sources=tuple(source.select(columns) for source in sources),
+            self, stream=stream, names=names, support=self.support[:, columns], sources=sources
         )
 
 
@@ -160,8 +153,8 @@ class Factors:
         """The factors over all c columns, shape (n, c + 1, c + 1), 0 for columns not of a joint."""
         size = len(self.names) + 1
         dense = np.zeros((len(self.triangles), size, size))
-        for R, (triangle, own) in zip(dense, self._joints(), strict=True):
-            places = np.append(own, size - 1)
+        for R, (triangle, columns) in zip(dense, self._joints(), strict=True):
+            places = np.append(columns, size - 1)
             R[np.ix_(places, places)] = triangle
         return dense
 
@@ -169,9 +162,9 @@ class Factors:
         """Return the factors of the same rows with fewer columns: columns (b,)."""
         columns = np.asarray(columns, dtype=int)
         triangles, remaining = [], []
-        for triangle, own in self._joints():
-            remaining.append(np.flatnonzero(np.isin(columns, own)))
-            places = np.append(np.searchsorted(own, columns[remaining[-1]]), len(own))
+        for triangle, of_joint in self._joints():
+            remaining.append(np.flatnonzero(np.isin(columns, of_joint)))
+            places = np.append(np.searchsorted(of_joint, columns[remaining[-1]]), len(of_joint))
             triangles.append(triangle_of(triangle[:, places]))
         names = tuple(self.names[i] for i in columns)
         return replace(self, triangles=tuple(triangles), columns=tuple(remaining), names=names)
@@ -179,18 +172,18 @@ class Factors:
     def weighted(self, sigma: Array) -> Array:
         """Return one factor, shape (c + 1, c + 1), of all joints' rows [W_j tau_j] / sigma_j."""
         total = Triangle(len(self.names) + 1)
-        for (triangle, own), level in zip(self._joints(), sigma, strict=True):
-            total.fold_triangle(triangle / level, np.append(own, len(self.names)))
+        for (triangle, columns), level in zip(self._joints(), sigma, strict=True):
+            total.fold_triangle(triangle / level, np.append(columns, len(self.names)))
         return total.R
 
     def weighted_rows(self, theta: Array, sigma: Array) -> tuple[Array, Array]:
         """Return rows W_j / sigma_j and (tau_j - W_j theta) / sigma_j that have these factors."""
         ends = np.cumsum([len(R) for R in self.triangles])
         W, residual = np.zeros((ends[-1], len(self.names))), np.empty(ends[-1])
-        for (R, own), level, end in zip(self._joints(), sigma, ends, strict=True):
+        for (R, columns), level, end in zip(self._joints(), sigma, ends, strict=True):
             rows = slice(end - len(R), end)
-            W[rows, own] = R[:, :-1] / level
-            residual[rows] = R[:, -1] / level - W[rows, own] @ theta[own]
+            W[rows, columns] = R[:, :-1] / level
+            residual[rows] = R[:, -1] / level - W[rows, columns] @ theta[columns]
         return W, residual
 
     def residual_squares(self, theta: Array) -> Array:
@@ -201,8 +194,8 @@ class Factors:
         """Return sum_j weight_j W_j^T (tau_j - W_j theta), shape (c,): theta (c,), weights (n,)."""
         total = np.zeros(len(self.names))
         parts = zip(self._joints(), self._residuals(theta), weights, strict=True)
-        for (R, own), residual, weight in parts:
-            total[own] += weight * (R[:, :-1].T @ residual)
+        for (R, columns), residual, weight in parts:
+            total[columns] += weight * (R[:, :-1].T @ residual)
         return total
 
     def without(self, theta: Array) -> "Factors":
@@ -226,13 +219,13 @@ class Factors:
     def information(self, weights: Array) -> Array:
         """Return sum_j weight_j W_j^T W_j, shape (c, c): weights (n,)."""
         total = np.zeros((len(self.names), len(self.names)))
-        for (R, own), weight in zip(self._joints(), weights, strict=True):
-            total[np.ix_(own, own)] += weight * (R[:, :-1].T @ R[:, :-1])
+        for (R, columns), weight in zip(self._joints(), weights, strict=True):
+            total[np.ix_(columns, columns)] += weight * (R[:, :-1].T @ R[:, :-1])
         return total
 
     def leverages(self, covariance: Array) -> Array:
         """Return the trace of W_j C W_j^T for each joint, shape (n,): covariance (c, c)."""
-        pairs = [(R[:, :-1], covariance[np.ix_(own, own)]) for R, own in self._joints()]
+        pairs = [(R[:, :-1], covariance[np.ix_(columns, columns)]) for R, columns in self._joints()]
         return np.array([np.vdot(A @ C, A) for A, C in pairs])
 
     def _joints(self) -> Iterator[tuple[Array, Array]]:
@@ -241,7 +234,7 @@ class Factors:
 
     def _residuals(self, theta: Array) -> Iterator[Array]:
         """Yield tau_j - W_j theta of the rows of each factor."""
-        return (R[:, -1] - R[:, :-1] @ theta[own] for R, own in self._joints())
+        return (R[:, -1] - R[:, :-1] @ theta[columns] for R, columns in self._joints())
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,7 +249,7 @@ class Reduction:
 def compress(problem: Problem, *, threads: int | None = None) -> Factors:
     """Fold a problem into factors, in parts of one size (Demmel, Grigori, Hoemmen, Langou 2012)."""
     columns = [np.flatnonzero(row) for row in problem.support]
-    triangles = [Triangle(len(own) + 1) for own in columns]
+    triangles = [Triangle(len(joint_columns) + 1) for joint_columns in columns]
     for source in problem.sources:
         places = _places(source, columns)
         for part in _folded(source, _PART, _PART, threads):
@@ -278,9 +271,7 @@ def _factors_of(
     return Factors(tuple(triangles), tuple(columns), rows, problem.names, problem.is_projected)
 
 
-def compress_segments(
-    problem: Problem, length: int, *, threads: int | None = None
-) -> tuple[Factors, ...]:
+def compress_segments(problem: Problem, length: int) -> tuple[Factors, ...]:
     """Fold each segment of a problem into its own factors, for held-out segments."""
     if not problem.sources:
         raise DataError("the problem has blocks only, expected row sources to cut into segments")
@@ -289,8 +280,7 @@ def compress_segments(
     segments = []
     for source in problem.sources:
         places, starts = _places(source, columns), range(0, source.samples, length)
-        folded = _folded(source, part, length, threads)
-        for start, triangles in zip(starts, folded, strict=True):
+        for start, triangles in zip(starts, _folded(source, part, length, None), strict=True):
             rows = source.rows(start, min(start + length, source.samples))
             placed = []
             for R, place, wanted in zip(triangles, places, columns, strict=True):
@@ -312,13 +302,13 @@ def merge(factors: Sequence[Factors]) -> Factors:
             raise DataError(f"factors differ: {' and '.join(sizes)}")
     triangles, columns = [], []
     for j in range(len(first.rows)):
-        own = np.unique(np.concatenate([f.columns[j] for f in factors]))
-        total = Triangle(len(own) + 1)
+        union = np.unique(np.concatenate([f.columns[j] for f in factors]))
+        total = Triangle(len(union) + 1)
         for f in factors:
-            places = np.append(np.searchsorted(own, f.columns[j]), len(own))
+            places = np.append(np.searchsorted(union, f.columns[j]), len(union))
             total.fold_triangle(f.triangles[j], places)
         triangles.append(total.R)
-        columns.append(own)
+        columns.append(union)
     rows = np.sum([f.rows for f in factors], axis=0)
     return replace(first, triangles=tuple(triangles), columns=tuple(columns), rows=rows)
 
@@ -348,29 +338,6 @@ def join_segments(reductions: Iterable[Reduction], count: int, most: int) -> lis
         else:
             segments.append(reduction)
     return segments
-
-
-def available_cores() -> int:
-    """Return the number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def in_order(
-    work: Callable[[ItemT], ResultT],
-    items: Sequence[ItemT],
-    *,
-    is_parallel: bool = True,
-    threads: int | None = None,
-) -> Iterator[ResultT]:
-    """Yield the result of work for each item in order, with threads where that is faster."""
-    most = (available_cores() if is_parallel else 1) if threads is None else threads
-    if (workers := min(most, len(items))) <= 1:
-        yield from map(work, items)
-        return
-    with ThreadPoolExecutor(workers) as pool:
-        yield from pool.map(work, items)
 
 
 class Triangle:
@@ -445,16 +412,15 @@ def _fold_blocks(
     triangles: Sequence[Triangle], columns: Sequence[Array], problem: Problem
 ) -> Array:
     """Fold whole blocks into the factors; return the number of rows per joint."""
-    n = problem.n_joints
-    rows = np.zeros(n, dtype=int)
+    n, rows = problem.n_joints, np.zeros(problem.n_joints, dtype=int)
     for W, tau, weight in problem.blocks():
         by_joint, torque = W.reshape(-1, n, W.shape[1]), tau.reshape(-1, n)
         root = np.sqrt(weight).reshape(-1, n)
         rows += (root > 0).sum(axis=0)
-        for j, own in enumerate(columns):
+        for j, joint_columns in enumerate(columns):
             used = np.flatnonzero(root[:, j] != 0)  # NaN counts as used: it appears in R
-            scaled = np.empty((len(used), len(own) + 1), order="F")
-            scaled[:, :-1] = by_joint[used, j][:, own]
+            scaled = np.empty((len(used), len(joint_columns) + 1), order="F")
+            scaled[:, :-1] = by_joint[used, j][:, joint_columns]
             scaled[:, -1] = torque[used, j]
             scaled *= root[used, j, None]
             triangles[j].fold(scaled)
@@ -464,8 +430,8 @@ def _fold_blocks(
 def _places(source: RowSource, columns: Sequence[Array]) -> list[Array]:
     """Return the places of each row's columns, and of its torque, among the wanted columns."""
     return [
-        np.append(np.searchsorted(wanted, own), len(wanted))
-        for wanted, own in zip(columns, source.columns, strict=True)
+        np.append(np.searchsorted(wanted, present), len(wanted))
+        for wanted, present in zip(columns, source.columns, strict=True)
     ]
 
 
@@ -483,7 +449,7 @@ def _fold_part(source: RowSource, length: int, segment: int, start: int) -> list
     folded, done = list[list[Triangle]](), 0
     for block in source.blocks(start, min(start + length, source.samples), segment):
         if done % segment == 0:
-            folded.append([Triangle(len(own) + 1) for own in source.columns])
+            folded.append([Triangle(len(columns) + 1) for columns in source.columns])
         done += len(block[0])
         for triangle, rows in zip(folded[-1], block, strict=True):
             triangle.fold(rows)

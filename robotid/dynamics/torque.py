@@ -136,17 +136,17 @@ def build_problem(
     compiled: bool | None = None,
 ) -> Problem:
     """Return the problem W pi = tau of a trajectory: blocks by Pinocchio, rows by either engine."""
-    own = trajectory_rows(model, trajectory, weight, compiled)
-    weights, used = own.weights, np.any(own.weights, axis=0, keepdims=True).T
-    own = replace(own, support=own.support & used)
-    source: RowSource = own
-    support = own.support
+    rows = trajectory_rows(model, trajectory, weight, compiled)
+    weights, used = rows.weights, np.any(rows.weights, axis=0, keepdims=True).T
+    rows = replace(rows, support=rows.support & used)
+    source: RowSource = rows
+    support = rows.support
     if trajectory.basis is not None:
-        own = trajectory_rows(model, trajectory, None, compiled)
+        rows = trajectory_rows(model, trajectory, None, compiled)
         mixed = mixed_rows(trajectory.basis, weights)[:, None]
-        own = replace(own, support=own.support & mixed)
-        source = ProjectedRows(own, trajectory.basis, weights)
-        support = own.support.any(axis=0) & used
+        rows = replace(rows, support=rows.support & mixed)
+        source = ProjectedRows(rows, trajectory.basis, weights)
+        support = rows.support.any(axis=0) & used
     samples = len(weights)
     length = max(1, min(BLOCK, BLOCK_SIZE // (model.n_rows * len(model.layout.names))))
 
@@ -297,19 +297,19 @@ def rigid_parts(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> l
     """Return gravity, inertia and velocity torques g, M a, C v of the bodies, (N, n_rows) each."""
     still = np.zeros_like(v)
     states = ((still, still), (still, a), (v, a))
-    g, g_and_Ma, total = (_bodies_torque(model, pi, q, *x) for x in states)
+    g, g_and_Ma, total = (bodies_torque(model, pi, q, *x) for x in states)
     return [g, g_and_Ma - g, total - g_and_Ma]
 
 
 def _from_rows(source: TrajectoryRows, stacked: Array) -> list[Array]:
     """Return the rows times the columns of (p, k), k arrays of shape (N, n_rows)."""
     torques = np.empty((stacked.shape[1], source.samples, len(source.columns)))
-    own = [stacked[columns] for columns in source.columns]
+    factors = [stacked[columns] for columns in source.columns]
     start = 0
     for block in source.blocks(0, source.samples):
         part = slice(start, start + len(block[0]))
         for j, rows in enumerate(block):
-            torques[:, part, j] = (rows[:, :-1] @ own[j]).T
+            torques[:, part, j] = (rows[:, :-1] @ factors[j]).T
         start = part.stop
     return list(torques)
 
@@ -320,8 +320,8 @@ def _from_kept(source: TrajectoryRows, inertial: InertialRows, stacked: Array) -
     torques, theta = inertial.torque(stacked), stacked[layout.n_inertial :]
     if theta.any():
         values = trajectory_values(layout, source.trajectory)  # (drive parameters, N)
-        for torque, own in zip(torques, theta.T, strict=True):
-            torque[:, source.model.n_rows - n :] += values.T @ (layout.drive_loads * own).T
+        for torque, theta_k in zip(torques, theta.T, strict=True):
+            torque[:, source.model.n_rows - n :] += values.T @ (layout.drive_loads * theta_k).T
     return list(torques)
 
 
@@ -334,13 +334,13 @@ def _has_centres(model: RobotModel, pi: Array) -> bool:
 
 def inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
     """Return the torque W pi by the recursive Newton-Euler algorithm and the drives' terms."""
-    torque = _bodies_torque(model, pi, trajectory.q, trajectory.v, trajectory.a)
+    torque = bodies_torque(model, pi, trajectory.q, trajectory.v, trajectory.a)
     if pi[model.layout.n_inertial :].any():
         torque[:, model.n_rows - len(model.joints) :] += drive_torque(model, pi, trajectory)
     return torque
 
 
-def _bodies_torque(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> Array:
+def bodies_torque(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> Array:
     """Return the torque of bodies, of inconsistent ones as a difference, shape (N, n_rows)."""
     return _of_consistent(_newton_euler, model, pi, q, v, a)[0]
 
@@ -360,8 +360,8 @@ def body_slopes(model: RobotModel, pi: Array, trajectory: Trajectory) -> TorqueS
 def force_slopes(model: RobotModel, trajectory: Trajectory) -> Array:
     """Return the derivatives of the torques by a force (3,) on the last body's tip, (N, n, 3)."""
     engine, G = model.pin_model, model.velocity_map
-    own = [k for k, frame in enumerate(engine.frames) if frame.parentJoint == engine.njoints - 1]
-    tip = max(own, key=lambda k: np.linalg.norm(engine.frames[k].placement.translation))
+    frames = [k for k, frame in enumerate(engine.frames) if frame.parentJoint == engine.njoints - 1]
+    tip = max(frames, key=lambda k: np.linalg.norm(engine.frames[k].placement.translation))
     slopes, data = np.empty((len(trajectory.q), len(G), 3)), engine.createData()
     for D, q in zip(slopes, model.configurations(trajectory.q), strict=True):
         J = pin.computeFrameJacobian(engine, data, q, tip, pin.LOCAL_WORLD_ALIGNED)
@@ -417,11 +417,11 @@ def _newton_euler(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) ->
 
 def _position_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> tuple[Array]:
     """Return the derivatives of the bodies' torque by the positions, shape (N, n, n)."""
-    own, G = model.with_parameters(pi).pin_model, model.velocity_map
-    slopes, data = np.empty((len(q), own.nv, own.nv)), own.createData()
+    pin_model, G = model.with_parameters(pi).pin_model, model.velocity_map
+    slopes, data = np.empty((len(q), pin_model.nv, pin_model.nv)), pin_model.createData()
     states = zip(model.configurations(q), v @ G.T, a @ G.T, strict=True)
     for D, state in zip(slopes, states, strict=True):
-        D[:] = pin.computeRNEADerivatives(own, data, *state)[0]
+        D[:] = pin.computeRNEADerivatives(pin_model, data, *state)[0]
     return (G.T @ slopes @ G,)
 
 
@@ -429,7 +429,7 @@ def _torque_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -
     """Return the arrays of ``TorqueSlopes`` (Carpentier, Mansard 2018, Analytical Derivatives)."""
     plain, G = model.with_parameters(pi).pin_model, model.velocity_map
     extended, joints = _with_movable_origins(plain)
-    own = np.array([extended.joints[k].idx_v for k in joints])  # rows of the robot's own joints
+    rows = np.array([extended.joints[k].idx_v for k in joints])  # rows of the robot's own joints
     before = np.array([extended.joints[k - 1].idx_v for k in joints])  # and of their places
     first_q = [(extended.joints[k].idx_q, plain.joints[i].idx_q, plain.joints[i].nq)
                for i, k in enumerate(joints, start=1)]  # fmt: skip
@@ -438,17 +438,17 @@ def _torque_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -
     for to, here, size in first_q:
         configurations[:, to : to + size] = known[:, here : here + size]
     velocities, accelerations = np.zeros((2, len(v), extended.nv))
-    velocities[:, own], accelerations[:, own] = v @ G.T, a @ G.T
-    slopes = np.empty((3, len(q), len(own), extended.nv))
+    velocities[:, rows], accelerations[:, rows] = v @ G.T, a @ G.T
+    slopes = np.empty((3, len(q), len(rows), extended.nv))
     derive, data = pin.computeRNEADerivatives, extended.createData()
     states = zip(configurations, velocities, accelerations, strict=True)
     for D_q, D_v, D_a, state in zip(*slopes, states, strict=True):
         by_q, by_v, by_a = derive(extended, data, *state)
-        by_q.take(own, 0, D_q, "clip")  # without bound checks
-        by_v.take(own, 0, D_v, "clip")
-        by_a.take(own, 0, D_a, "clip")
+        by_q.take(rows, 0, D_q, "clip")  # without bound checks
+        by_v.take(rows, 0, D_v, "clip")
+        by_a.take(rows, 0, D_a, "clip")
     D: Array = G.T @ slopes  # tau = G^T tau_pinocchio
-    by_q, by_v, by_a = D[..., own] @ G
+    by_q, by_v, by_a = D[..., rows] @ G
     leaders = np.array([plain.getJointId(name) - 1 for name in model.joints])
     first = before[leaders][:, None]
     rotations = np.array([plain.jointPlacements[i + 1].rotation for i in range(len(before))])

@@ -85,17 +85,17 @@ def _drives(
         names = wanted[joint]
         if not used[:, j].any() or (names is not None and not names) or joint in fit.model.passive:
             continue
-        own = tuple(motion.of(j) for motion in motions)
+        logged = tuple(motion.of(j) for motion in motions)
         plain = {
             name: sample.U[:, k]
             for k, name in enumerate(fit.mapping.base_names)
             if name.startswith(f"{joint}.")
         }
-        taken = [(m.q[rows], m.v[rows]) for m, rows in zip(own, sample.taken, strict=True)]
+        taken = [(m.q[rows], m.v[rows]) for m, rows in zip(logged, sample.taken, strict=True)]
         q, v = (np.concatenate(x)[used[:, j]] for x in zip(*taken, strict=True))
         ends = {key: (float(x.min()), float(x.max())) for key, x in (("q", q), ("v", np.abs(v)))}
         is_prismatic, has_load = bool(sample.is_prismatic[j]), sample.basis is None
-        drives[j] = _Drive(is_prismatic, has_load, own, sample.taken, ends, plain)
+        drives[j] = _Drive(is_prismatic, has_load, logged, sample.taken, ends, plain)
     return drives
 
 
@@ -119,25 +119,25 @@ def _candidates(drive: _Drive, families: Sequence[Family]) -> Iterator[_Sized]:
 class _Options:
     """Candidates of a joint, with every shape on the grid, and their residuals."""
 
-    own: list[_Sized]
+    candidates: list[_Sized]
     place: dict[int, list[int]]  # columns of each
     is_positive: Array  # columns whose parameter cannot be negative, bool
     highest: Array  # upper bounds of their parameters
     trials: Trials
 
     @classmethod
-    def of(cls, sample: Sample, drive: _Drive, own: list[_Sized]) -> "_Options":
-        terms = [_terms(drive, [one]) for one in own]
+    def of(cls, sample: Sample, drive: _Drive, candidates: list[_Sized]) -> "_Options":
+        terms = [_terms(drive, [one]) for one in candidates]
         columns = {i: drive.columns(of_family)[:, None] for i, of_family in enumerate(terms)}
         trials, place = Trials.of(sample, columns)
         flat = [term for of_family in terms for term in of_family]
         positive = np.array([term.is_nonnegative for term in flat], dtype=bool)
         highest = np.array([x.highest for x in flat])
-        return cls(own, place, positive, highest, trials)
+        return cls(candidates, place, positive, highest, trials)
 
     def name(self, i: int) -> str:
         """Return the family of a candidate."""
-        return self.own[i][0].name
+        return self.candidates[i][0].name
 
     def simplicity(self, i: int) -> tuple[int, int]:
         """Return the columns of a candidate, and the place of its family in their order."""
@@ -151,7 +151,7 @@ class _Options:
         """Return the squared residual of each segment with those chosen and another candidate."""
         # Of candidates that oppose motion, one family of each kind.
         kinds = {_kind(self.name(k)) for k in chosen}
-        other = [i for i in range(len(self.own)) if _kind(self.name(i)) not in kinds]
+        other = [i for i in range(len(self.candidates)) if _kind(self.name(i)) not in kinds]
         columns = {i: self._columns([*chosen, i]) for i in other}
         theta = self.trials.whole.parameters_each(columns)
         possible = {
@@ -194,13 +194,13 @@ def _auto(sample: Sample, drive: _Drive) -> DriveChoice:
         if refined is None:
             nearest = min(this.left, key=lambda i: float(this.left[i].sum()), default=None)
             if nearest is not None and this.p_value(nearest) < decisions.UNDECIDED_P_VALUE:
-                undecided = [every.own[nearest]]
+                undecided = [every.candidates[nearest]]
             break
-        every = _Options.of(refined.weighted, drive, [*refined.own, *grid])
+        every = _Options.of(refined.weighted, drive, [*refined.families, *grid])
         torque = float(refined.weighted.torque[0])
-        chosen = list(range(len(refined.own)))
+        chosen = list(range(len(refined.families)))
         before = every.left(chosen)
-    choice = _found(sample, drive, [every.own[i] for i in chosen], tuple(tried))
+    choice = _found(sample, drive, [every.candidates[i] for i in chosen], tuple(tried))
     return replace(choice, undecided=_terms(drive, undecided))
 
 
@@ -209,7 +209,7 @@ class _Refined:
     """A candidate together with those chosen, with shapes refined between the grid's values."""
 
     number: int
-    own: list[_Sized]  # those chosen and the candidate
+    families: list[_Sized]  # those chosen and the candidate
     weighted: Sample  # the samples with weights from the residual with these
     faults: tuple[bool, bool]  # a shape is at its bound, a standard error increases tenfold
 
@@ -223,13 +223,14 @@ def _conditioned(
     # Equally good: by the rule of the selection. Better conditioned: no shape at its bound, or no
     # standard error of the drive increased tenfold.
     def refined(i: int) -> _Refined:
-        own = _refined(sample, drive, [every.own[k] for k in (*chosen, i)])
-        weighted = _reweighted(sample, drive, own)
-        is_grown = max(_grown(weighted, drive, own).values(), default=1.0) > decisions.TENFOLD
-        return _Refined(i, own, weighted, (bool(_at_bound(drive, own).any()), is_grown))
+        families = _refined(sample, drive, [every.candidates[k] for k in (*chosen, i)])
+        weighted = _reweighted(sample, drive, families)
+        is_grown = max(_grown(weighted, drive, families).values(), default=1.0) > decisions.TENFOLD
+        return _Refined(i, families, weighted, (bool(_at_bound(drive, families).any()), is_grown))
 
     def left_of(other: _Refined) -> float:
-        return float(_Options.of(sample, drive, other.own).left(range(len(other.own))).sum())
+        families = other.families
+        return float(_Options.of(sample, drive, families).left(range(len(families))).sum())
 
     first = refined(best)
     if not any(first.faults):
@@ -271,7 +272,7 @@ def _fixed(sample: Sample, drive: _Drive, names: Sequence[str]) -> DriveChoice:
     """Return the stated families with the shapes that fit best."""
     families = [FAMILIES[name] for name in names]
     every = _Options.of(sample, drive, list(_candidates(drive, families)))
-    groups = [[i for i, (f, _) in enumerate(every.own) if f.name == name] for name in names]
+    groups = [[i for i, (f, _) in enumerate(every.candidates) if f.name == name] for name in names]
     missing = [name for name, group in zip(names, groups, strict=True) if not group]
     if missing:
         raise SettingsError(
@@ -293,7 +294,7 @@ def _fixed(sample: Sample, drive: _Drive, names: Sequence[str]) -> DriveChoice:
         Tried(which, _percent(every.left(columns), float(sample.torque[0])), 1.0, bool(which))
         for which, columns in (((), []), (tuple(names), chosen))
     )
-    return _found(sample, drive, [every.own[i] for i in chosen], tried)
+    return _found(sample, drive, [every.candidates[i] for i in chosen], tried)
 
 
 def _found(
@@ -322,14 +323,14 @@ def _found(
             for k, (name, shape) in enumerate(named)
         ),
         shape_covariance=tuple(tuple(row) for row in covariance.tolist()),
-        sizes=tuple(tuple(own) for _, own in refined),
+        sizes=tuple(tuple(sizes) for _, sizes in refined),
         data_range=drive.data_range,
     )  # fmt: skip
 
 
 def _flat(chosen: Sequence[_Sized]) -> Array:
     """Return all shapes of families in a row, shape (k,)."""
-    return np.array([size for _, own in chosen for size in own])
+    return np.array([size for _, sizes in chosen for size in sizes])
 
 
 def _at_bound(drive: _Drive, chosen: Sequence[_Sized]) -> Array:
@@ -367,7 +368,7 @@ def _reweighted(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> Samp
 
 def _terms(drive: _Drive, chosen: Sequence[_Sized]) -> tuple[DriveTerm, ...]:
     """Return the terms of families with their shapes."""
-    return tuple(term for family, own in chosen for term in family.make(drive.data_range, *own))
+    return tuple(term for family, sizes in chosen for term in family.make(drive.data_range, *sizes))
 
 
 def _log_bounds(drive: _Drive, chosen: Sequence[_Sized]) -> Array:

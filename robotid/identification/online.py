@@ -374,13 +374,13 @@ class OnlineIdentifier:
                 f"update takes (t, q, tau) or (t, q, v, a, tau), found {2 + len(rest)} values"
             )
         if not is_number(t):
-            raise DataError(f"the sample at t = {str(t)[:60]} s is not finite, so it was refused")
+            raise DataError(f"the sample at t = {str(t)[:60]} s is not finite; leave it out")
         arrays = [real_numbers(x, name) for name, x in zip(names, (q, *rest), strict=True)]
         n, shapes = len(self.model.joints), [np.shape(x) for x in arrays]
         if any(shape != (n,) for shape in shapes):
             raise DataError(f"{listed(names)} have shapes {listed(shapes)}, expected ({n},) each")
         if not (np.isfinite(t) and all(np.isfinite(x).all() for x in arrays)):
-            raise DataError(f"the sample at t = {t:g} s is not finite, so it was refused")
+            raise DataError(f"the sample at t = {t:g} s is not finite; leave it out")
         if t <= self._now:
             raise DataError(f"t must increase, but {t:.15g} s follows {self._now:.15g} s")
         if len(rest) == 1:

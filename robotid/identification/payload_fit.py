@@ -410,7 +410,9 @@ def _payload_columns(model: RobotModel, K: Array, links: Sequence[str]) -> Array
     for link in links:
         body, transfer = link_transfer(model, link)
         if body < 0:
-            raise SettingsError(f"{link} does not move: no torque depends on its payload")
+            raise SettingsError(
+                f"{link} does not move, so no torque depends on its payload; name a moving link"
+            )
         if body in bodies:
             raise SettingsError(
                 f"{bodies[body]} and {link} belong to one moving body, {model.layout.bodies[body]}:"

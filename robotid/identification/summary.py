@@ -133,9 +133,9 @@ def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
 
 
 def verdict_cell(joint: str, verdict: Mapping[str, Any]) -> str:
-    """Return the verdict on a joint with its first reason, as in "usable: error 20 % on b.csv"."""
+    """Return the verdict on a joint with its first reason, as in "usable, error 20 % on b.csv"."""
     status, why = verdict["status"], joint_reason(joint, verdict["reasons"])
-    return str(status) if status == "good" or not why else f"{status}: {why}"
+    return str(status) if status == "good" or not why else f"{status}, {why}"
 
 
 def joint_reason(joint: str, reasons: Sequence[str]) -> str:

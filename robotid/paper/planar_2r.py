@@ -91,7 +91,7 @@ def regressor(q: Array, v: Array, a: Array, *, form: Form = "corrected") -> Arra
 
     q (..., 2) [rad], v (..., 2) [rad/s], a (..., 2) [rad/s^2].
     """
-    (_, q2), (v1, v2), (a1, a2) = (np.moveaxis(x, -1, 0) for x in (q, v, a))
+    (_, q2), (v1, v2), (a1, a2) = ((x[..., 0], x[..., 1]) for x in (q, v, a))
     c2, s2, a12, v12 = np.cos(q2), np.sin(q2), 2 * a1 + a2, v2**2 + 2 * v1 * v2
     row1 = [a1, a1 + a2, c2 * a12 - 2 * s2 * v1 * v2, -s2 * v2**2, -s2 * a12 - c2 * v12]
     row2 = [0.0, a1 + a2, c2 * a1, s2 * v1**2, -s2 * a1 + c2 * v1**2]

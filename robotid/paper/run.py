@@ -61,7 +61,7 @@ _RESULT = (
 )  # fmt: skip
 _PARAMETERS = (
     ("parameter", "code", "name"), ("true", ".4g", "true"), ("estimate", ".7g", "estimate"),
-    ("difference", ".1e", "difference"),
+    ("difference", ".2g", "difference"),
 )  # fmt: skip
 _VECTOR = (
     ("parameter", "code", "name"), ("true", ".4g", "true"), ("identified", ".7g", "value"),
@@ -287,7 +287,7 @@ def _summary(content: Mapping[str, Any]) -> str:
     models, on_program = content["models"], content["on_program"]
     last = {name: model["relative_error"][-1] for name, model in models.items()}
     others = {name: on_program[name]["relative_error"][-1] for name in models}
-    gains = [others[name] / error for name, error in last.items()]
+    ratios = sorted({f"{others[name] / error:.2g}" for name, error in last.items()}, key=float)
     reached = "".join(
         block(
             "paper.reached", name=escape(name), error=number(error, ".2g").html,
@@ -304,8 +304,7 @@ def _summary(content: Mapping[str, Any]) -> str:
         trial=block("paper.trial", count=count, usual=usual) if count < usual else "",
         reached=reached,
         beside=f"{beside:.3g}",
-        least=f"{min(gains):.2g}",
-        most=f"{max(gains):.2g}",
+        ratios=" to ".join(dict.fromkeys((ratios[0], ratios[-1]))),
         version=__version__,
     )
 

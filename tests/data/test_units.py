@@ -56,6 +56,7 @@ SUSPECTED = [
     (dict(q=Q * [-2.1 * 2 * np.pi / np.abs(Q[:, 0]).max(), 1.0], v=None), "angle_unit",
      "q_a reaches 13.19, which looks like degrees (in radians 2.1 revolutions)"),
     (dict(q_ref=Q * 57.3 * 2), "angle_unit", "qref_a reaches 91."),
+    (dict(t=T * 1e3, q=Q * 300.0, v=None), "time_unit", "multiply by 0.001. q_a reaches 240, "),
 ]  # fmt: skip
 
 

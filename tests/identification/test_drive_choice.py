@@ -182,8 +182,8 @@ def test_of_families_alike_the_better_conditioned_is_chosen(plain, rising):
     (said,) = [f for f in stated.findings if f.code == "correlated_terms"]
     assert (said.severity, said.where) == ("note", ELBOW)
     assert re.match(
-        r"elbow_joint: coulomb \S+ \+- \S+, stribeck \S+ \+- \S+ are strongly correlated "
-        r"\(r = -0\.9\d+\): use their sum; friction and offset are \S+ \+- \S+ at \S+ and ",
+        r"elbow_joint: the errors of coulomb \S+ \+- \S+ and stribeck \S+ \+- \S+ are strongly "
+        r"correlated \(r = -0\.9\d+\): .* together are \S+ \+- \S+ N m at \S+ rad/s and ",
         said.message,
     )
     names, C = stated.model.layout.names, stated.standard_covariance

@@ -15,6 +15,7 @@ from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import predict, trajectory_regressor
 from robotid.estimation.estimators import WLS
+from robotid.estimation.fitting.fitted import next_errors
 from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.identification.repeated_errors import with_repeated_errors
 from robotid.robot.constraints import Contact
@@ -67,6 +68,15 @@ def truth_of(model):
     return model.standard_parameters() + [
         sum(x for end, x in drives.items() if name.endswith(end)) for name in model.layout.names
     ]
+
+
+def test_the_expected_errors_are_those_of_unseen_steps(found):
+    (unseen,) = found[0].validation
+    residual = unseen.recording.trajectory.tau - unseen.torques["estimate"]
+    measured = np.sqrt(np.mean(residual**2, axis=0, where=unseen.recording.mask))
+    ratio = next_errors(found[0]) / measured
+    np.testing.assert_allclose(ratio[6:], 1.0, atol=0.15)
+    np.testing.assert_allclose(ratio[:6], 1.0, atol=0.6)  # few rows of the base are determined
 
 
 def test_the_bodies_of_another_simulator_are_found(found):

@@ -99,7 +99,7 @@ def test_a_drive_term_at_its_bound_has_no_error_and_what_stands_moved_little(ur5
     open_ones = {found.mapping.base_names[k] for k in np.flatnonzero(np.isinf(found.base_error))}
     assert open_ones <= set(at_bound)
     (finding,) = [f for f in found.findings if f.code == "at_bound"]
-    assert finding.message.startswith(f"{', '.join(at_bound)}: 0, at the bound")
+    assert finding.message.startswith(f"{', '.join(at_bound)}: the estimate is 0, its bound")
     for i, source in enumerate(found.sources):
         if source == "prior":
             assert abs(found.standard[i] - found.prior[i]) <= 0.3 * found.prior_std[i]
@@ -174,7 +174,7 @@ def test_a_reason_of_a_joint_is_shown_once():
         },
     }
     assert verdict_lines(verdict) == [
-        "verdict: poor", "  a: poor: bad", "  c: usable: slow", "  - a: slow", "  - no log",
+        "verdict: poor", "  a: poor, bad", "  c: usable, slow", "  - a: slow", "  - no log",
         "  b, d: good",
     ]  # fmt: skip
     alone = {"status": "good", "reasons": ["fine"], "per_joint": {"b": verdict["per_joint"]["b"]}}

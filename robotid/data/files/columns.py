@@ -572,10 +572,9 @@ class Finder:
         commanded = [x for x in names if is_commanded(x) and x in {*left, *read}]
         others = [name for name in left if name not in commanded]
         named = f"column{'s' * (len(sought) > 1)} {listed(map(repr, sought), _SHOWN)}"
-        text = (
-            f"{self.where} has no {named}; {' and '.join(nouns)}{' ' * bool(nouns)}columns found: "
-            f"{listed(of_kind, _SHOWN)}."
-        )
+        found = f"{' and '.join(nouns)} columns found: {listed(of_kind, _SHOWN)}".strip()
+        nothing = f"no {' or '.join(nouns)} columns were recognised"
+        text = f"{self.where} has no {named}; {found if of_kind else nothing}."
         for label, some in (
             ("Commanded, not measured", [name for name in commanded if name not in of_kind]),
             ("Loads without sign, which are no torques", sizes),
@@ -591,12 +590,12 @@ class Finder:
         lines += [f'# {toml_key(key)} = "NAME"' for key in open_keys if key not in by_order]
         if by_order:
             remedy += (
-                ". If joints have other names in the log, this table pairs them by order: check "
-                "each line, an exchange of joints gives wrong parameters"
+                ". This table pairs joints with other names by order: check each line, an exchange "
+                "of joints gives wrong parameters"
             )
         return DataError(
-            f"{text} {remedy}. Rename the columns, or set them in the job file:\n[columns]\n"
-            + "\n".join([*lines, *self._units_by_name({**recognised, **by_order})]),
+            f"{text} {remedy}. If the log has other names for them, set these in the job file:\n"
+            + "\n".join(["[columns]", *lines, *self._units_by_name({**recognised, **by_order})]),
             code="missing_column",
         )
 

@@ -498,9 +498,9 @@ def check_suffix(path: Path, what: str = "logs", *, also: Sequence[str] = ()) ->
     """Return the suffix of a file to write; used before its content is computed."""
     suffix = path.suffix.lower()
     if suffix not in _WRITTEN:
+        found = f"not {suffix!r}" if suffix else "but the name has no extension"
         raise DataError(
-            f"{path.name}: {what} are written as {_alternatives([*_WRITTEN, *also])} files, not "
-            f"{suffix!r}"
+            f"{path.name}: {what} are written as {_alternatives([*_WRITTEN, *also])} files, {found}"
         )
     return suffix
 

@@ -355,10 +355,7 @@ def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
     at = max(gaps, key=lambda k: step[k])
     longest, start = float(step[at]), float(log.t[at])
     severity = "warning" if longest > _LONG else "note"
-    yield finding(
-        "gap", log.name, severity=severity, gaps=len(gaps), longest=longest, at=start,
-        when=seconds(start),
-    )  # fmt: skip
+    yield finding("gap", log.name, severity=severity, gaps=len(gaps), longest=longest, at=start)
 
 
 def _bunches(log: Log, step: Array) -> Iterator[Finding]:

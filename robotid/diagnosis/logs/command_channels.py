@@ -369,4 +369,5 @@ def _disturbed(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
         fit = others @ np.linalg.lstsq(others, moved)[0]
         share = 1 - float(np.sum((moved - fit) ** 2) / np.sum(moved**2))
         if share >= MOST:
-            yield finding("moved_by_others", log.name, loop.name, size=size, share=share)
+            figures = {"size": size, "share": share}
+            yield finding("moved_by_others", log.name, loop.name, unit=loop.unit, **figures)

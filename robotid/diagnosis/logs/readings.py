@@ -198,7 +198,9 @@ class Samples:
         read[:, 1 + self.order[rows]] = on * self.sign[rows] / gain
         b = G[..., c:] @ read[..., None]  # (K, m, C, 1)
         made = np.empty((*G.shape[:2], c + 1, c + 1))
-        made[..., :c, :c] = scale[:, :, None] * scale[:, None] * G[..., :c, :c]
+        made[..., :c, :c] = G[..., :c, :c]
+        if (gain != 1.0).any():
+            made[..., :c, :c] *= scale[:, :, None] * scale[:, None]
         made[..., :c, c] = made[..., c, :c] = scale * b[..., :c, 0]
         made[..., c, c] = (read[:, None] @ b[..., c:, :])[..., 0, 0]
         return made, m.size[self.order[rows]] / gain**2
@@ -207,7 +209,7 @@ class Samples:
     def share(self) -> Array:
         """Unexplained share of each torque of the limb, fitted to all instants, (m,)."""
         products, size = self._problem
-        whole = products.sum(axis=0)
+        whole = products.sum(axis=0) if len(products) > 1 else products[0]
         return _over(_left(whole, _fitted(self.motion, whole, size)), size)
 
     @cached_property
@@ -265,16 +267,15 @@ def _fitted(motion: _Motion, products: Array, size: Array) -> Array:
     A, b = np.zeros((p + _DRIVE * m,) * 2), np.zeros(p + _DRIVE * m)
     for _ in range(2):
         weight = len(motion.q) / np.where(size > 0.0, noise + EXACT * size, np.inf)
-        weighted = weight[:, None, None] * products
+        total = np.tensordot(weight, products, axes=1)  # of the bodies, which the joints share
         if is_projected:
-            A[:], b[:] = weighted[:, :c, :c].sum(axis=0), weighted[:, :c, c].sum(axis=0)
+            A[:], b[:] = total[:c, :c], total[:c, c]
         else:
-            A[:p, :p] = weighted[:, :p, :p].sum(axis=0)
-            A[own, :p] = weighted[:, p:c, :p]
-            A[own[:, :, None], own[:, None]] = weighted[:, p:c, p:c]
-            b[:p], b[own] = weighted[:, :p, c].sum(axis=0), weighted[:, p:c, c]
-        diagonal = np.diagonal(A).copy()
-        np.fill_diagonal(A, (1.0 + EXACT**2) * diagonal + 1.0)
+            drives = weight[:, None, None] * products[:, p:c]
+            A[:p, :p], b[:p] = total[:p, :p], total[:p, c]
+            A[own, :p], b[own] = drives[..., :p], drives[..., c]
+            A[own[:, :, None], own[:, None]] = drives[..., p:c]
+        np.fill_diagonal(A, (1.0 + EXACT**2) * np.diagonal(A) + 1.0)
         L = dpotrf(A, lower=True)[0]
         y = dtrtrs(L, b, lower=True)[0]
         d = nnls(L[first:, first:].T, y[first:])[0]

@@ -279,8 +279,7 @@ def cut_segments(sizes: Sequence[int], independent: float) -> tuple[slice, ...]:
     for rows in sizes:
         enough = max(1, int(rows * independent / decisions.SHORTEST))
         count = min(decisions.SEGMENTS, enough) if rows else 0
-        first = edges[-1]
-        edges += [first + rows * (i + 1) // count for i in range(count)]
+        edges += [edges[-1] + rows * (i + 1) // count for i in range(count)]
     return tuple(slice(*pair) for pair in pairwise(edges))
 
 
@@ -358,8 +357,10 @@ class Trial:
         """Return the parameters of some columns and their covariance, shapes (k,) and (k, k)."""
         # From the scatter of the scores between segments: valid for noise of any colour.
         theta, S = self.parameters(which), self.S[which][:, which]
-        H = self.H[:fitted, which]
-        scores = H[:, :, -1] - H[:, :, which] @ theta  # (K, k)
+        own = [*which, -1]  # all columns together are many
+        rows = [(W, X[:, own]) for W, X in self.rows[:fitted]]
+        H = replace(self, T=self.T[:, own], rows=rows).H[:, :-1]
+        scores = H[:, :, -1] - H[:, :, :-1] @ theta  # (K, k)
         inverse, few = np.linalg.inv(S), len(scores) / (len(scores) - 1)
         covariance: Array = few * (inverse @ (scores.T @ scores) @ inverse)
         return theta, covariance

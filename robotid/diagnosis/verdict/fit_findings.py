@@ -152,15 +152,14 @@ def correlated_findings(fit: Fit) -> Iterator[Finding]:
             f"{names[m].rpartition('.')[2]} {fit.standard[m]:.3g} +- {fit.standard_error[m]:.2g}"
             for m in sorted((i, k))
         ]
-        curve = fit.friction(joint)
+        curve, is_prismatic = fit.friction(joint), joint in fit.model.layout.prismatic
+        force, speed = ("N", "m/s") if is_prismatic else ("N m", "rad/s")
         sums = " and ".join(
-            f"{curve.torque[m]:.3g} +- {curve.std[m]:.2g} at {curve.v[m]:.3g}"
+            f"{curve.torque[m]:.3g} +- {curve.std[m]:.2g} {force} at {curve.v[m]:.3g} {speed}"
             for m in (len(curve.v) // 2, -1)  # the slowest and the fastest
         )
-        unit = "m/s" if joint in fit.model.layout.prismatic else "rad/s"
-        yield finding(
-            "correlated_terms", "", joint, pair=listed(single), sums=sums, unit=unit, r=r
-        )  # fmt: skip
+        pair = " and ".join(single)
+        yield finding("correlated_terms", "", joint, pair=pair, sums=sums, r=r)
 
 
 def _correlations(C: Array, own: Sequence[int]) -> Array:
@@ -367,9 +366,10 @@ def _stated_of(fit: Fit, body: str) -> dict[str, float]:
 
 def _of_outliers(fit: Fit) -> Finding:
     outliers, more = fit.outliers, len(fit.outliers) - NAMED
+    units = dict(zip(fit.model.row_names, fit.model.row_units, strict=True))
     places = "; ".join(
         f"{o.joint} at {o.t:.3f} s of {o.log}: measured {o.torque:.4g}, predicted "
-        f"{o.predicted:.4g}, residual {o.size:.0f} times the typical one"
+        f"{o.predicted:.4g} {units[o.joint]}, residual {o.size:.0f} times the typical one"
         for o in outliers[:NAMED]
     ) + f"; and {more} more" * (more > 0)
     return finding(

@@ -272,7 +272,7 @@ class ScaleCheck:
             names=" and ".join(beyond), limit=limit, held=not self.follows,
             spread=self._is_urdf and limit > AGREES, common=common, half=half,
             cause=next(cause for cause, holds in causes.items() if holds), factor=self.factor,
-            load=self.masses[2], ratios=listed(single),
+            state=self.contradicts, load=self.masses[2], ratios=listed(single),
         )  # fmt: skip
 
     @property

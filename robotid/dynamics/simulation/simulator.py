@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -24,7 +25,7 @@ from robotid.dynamics.simulation.simulation_settings import (
     Truth,
     by_joint,
 )
-from robotid.dynamics.torque import predict, remember
+from robotid.dynamics.torque import bodies_torque, predict, remember
 from robotid.robot.bodies import link_transfer
 from robotid.robot.drive_term import DIRECTED, LOADED, PLAIN, MemorylessTerm
 from robotid.robot.drives import Bristles, Lag
@@ -232,8 +233,7 @@ class _Group:
     kind: int  # PLAIN, DIRECTED or LOADED: its place in ``Friction``
 
 
-@dataclass(frozen=True)
-class Friction:
+class Friction(NamedTuple):
     """Friction torque of drives, ``(along + loaded |load|) sign(w) + rest``, all of shape (d,)."""
 
     rest: Array
@@ -258,7 +258,7 @@ class RobotPlant:
         self.armature = drive_inertia(model.layout, pi)  # (n, n)
         self.ratios = model.layout.drive_ratios  # (d, n)
         self._share = self.ratios / np.sum(self.ratios**2, axis=1, keepdims=True).clip(min=1e-300)
-        self._groups, self._constant = _grouped(model, pi)
+        self._groups, self._linear = _grouped(model, pi)
         self.n_states = sum(g.states.stop - g.states.start for g in self._groups)
         self.is_loaded = any(group.kind == LOADED for group in self._groups)
         G, A, engine = model.velocity_map, self.armature, model.pin_model
@@ -275,8 +275,7 @@ class RobotPlant:
         x = self._configuration(q)
         if self._is_plain:
             return np.array(pin.crba(self._driven, self._data, x))
-        rigid = rigid_mass_matrices(self._bodies, x[None], self._data)[0]
-        return np.asarray(rigid + self.armature)
+        return np.asarray(rigid_mass_matrices(self._bodies, x[None], self._data)[0] + self.armature)
 
     def bodies_torque(self, q: Array, v: Array, a: Array) -> Array:
         """Return the inverse dynamics of the bodies alone, shape (n,) [N m or N]."""
@@ -286,7 +285,8 @@ class RobotPlant:
     def friction(self, q: Array, v: Array, z: Array | None = None) -> Friction:
         """Return the friction of the drives, without inertia and the sign of the speed."""
         angle, w = self.ratios @ q, self.ratios @ v
-        parts = self._constant.copy()
+        parts = self._linear[:-1].copy()
+        parts[PLAIN] += self._linear[-1] * w
         for group in self._groups:
             term, drives, theta = group.term, group.drives, group.theta
             if not isinstance(term, Bristles):
@@ -346,9 +346,8 @@ class RobotPlant:
         """Return the acceleration consistent with load-dependent friction, by iteration."""
         D = self.mass_matrix(q)
         per_load = np.linalg.solve(D, self.ratios.T * coefficient)  # acceleration per load, (n, d)
-        bare = self._share @ (free - self.armature @ a)  # load of the drives without it
+        load = bare = self._share @ (free - self.armature @ a)  # load of the drives without it
         slope = self._share @ (self.ratios.T * coefficient - self.armature @ per_load)
-        load = bare
         if not np.isfinite(bare).all():  # the state has diverged
             return a
         for _ in range(_ITERATIONS):
@@ -369,24 +368,24 @@ class RobotPlant:
 
 
 def _grouped(model: RobotModel, pi: Array) -> tuple[list[_Group], Array]:
-    """Return the friction terms of the drives that vary, and ``Friction`` (3, d) of the others."""
+    """Return terms of drives, and ``Friction`` and damping of the linear ones, shape (4, d)."""
     layout, theta = model.layout, pi[model.layout.n_inertial :]
     terms: dict[Bristles | MemorylessTerm, list[int]] = {}
     for k, (_, term) in enumerate(layout.drive_parameters):
         if theta[k] != 0.0 and isinstance(term, Bristles | MemorylessTerm):
             terms.setdefault(term, []).append(k)
-    groups, constant, states = [], np.zeros((3, len(layout.drives))), 0
+    groups, linear, states = [], np.zeros((4, len(layout.drives))), 0
     for term, numbers in terms.items():
         drives = [layout.drive_parameters[k][0] for k in numbers]
         is_all = drives == list(range(len(layout.drives)))
         first, states = states, states + len(numbers) * isinstance(term, Bristles)
         chosen = slice(None) if is_all else np.array(drives)
         kind = term.kind if isinstance(term, MemorylessTerm) else DIRECTED
-        if isinstance(term, MemorylessTerm) and term.affine in (0, 2):
-            constant[kind, chosen] += theta[numbers]
+        if isinstance(term, MemorylessTerm) and term.affine is not None:
+            linear[-1 if term.affine == 1 else kind, chosen] += theta[numbers]
         else:
             groups.append(_Group(term, chosen, theta[numbers], slice(first, states), kind))
-    return groups, constant
+    return groups, linear
 
 
 class _Loop:
@@ -566,7 +565,7 @@ class _Torque:
         """Return the feed-forward torque along a motion, shape (N, n)."""
         if self.kind != "feedforward":
             return np.zeros_like(q)
-        return np.stack([self.nominal.bodies_torque(*one) for one in zip(q, v, a, strict=True)])
+        return bodies_torque(self.nominal.model, self.nominal.pi, q, v, a)
 
     def of(self, q: Array, v: Array, q_r: Array, v_r: Array, a_r: Array, forward: Array) -> Array:
         """Return the torque command of the drives, shape (n,)."""

@@ -249,8 +249,12 @@ class Solved:
         """Return the fit: the parameters with their standard errors and predictions."""
         ground, logs, before = self.ground, self.recordings, self.ground.before
         mapping, K = logs.mapping, logs.mapping.K
-        estimate, wls, errors = self._measured()
+        estimate, wls, errors = self._measured(ground)
         _, covariance = standard_of(estimate, mapping, before.pi, before.spread)
+        repeated: Array | float = 0.0
+        if logs.repeated is not None:
+            alone = self._measured(replace(ground, recordings=replace(logs, repeated=None)))[0]
+            repeated = covariance - standard_of(alone, mapping, before.pi, before.spread)[1]
         driven = urdf_with_drives(logs.model, mapping, ground.factors, before.sigma, before.spread)
         fitted, validation = evaluate_logs(
             logs.fitted, logs.validation,
@@ -266,7 +270,7 @@ class Solved:
         fit = Fit(
             model=logs.model, mapping=mapping, estimator=self.choice, estimate=estimate, wls=wls,
             prior=before.pi, urdf_with_drives=driven, prior_std=self.prior_std,
-            standard=self.standard, standard_covariance=covariance,
+            standard=self.standard, standard_covariance=covariance, repeated=repeated,
             base=mapping.to_base(self.standard), base_error=base_error,
             fitted=fitted, validation=validation, errors=errors, factors=ground.factors,
             determination=ground.determination, regressor_noise=ground.noise, sums=sums,
@@ -303,9 +307,9 @@ class Solved:
         sigma = ground.rough.sigma
         return run_sums(self.recordings, ground.logs, self.standard, sigma, shift)
 
-    def _measured(self) -> tuple[Estimate, Estimate, StandardErrors]:
+    def _measured(self, ground: "_Ground") -> tuple[Estimate, Estimate, StandardErrors]:
         """Return the estimate and that of WLS with standard errors, and how these were found."""
-        ground, fit, estimate = self.ground, self.in_cone, self.estimate
+        fit, estimate = self.in_cone, self.estimate
         rough, mapping = ground.rough, ground.recordings.mapping
         rows = ground.segments, ground.factors, ground.before.share, mapping.K
         are_alike = self.weighing == "alike"

@@ -192,6 +192,7 @@ class Fit(Identified, Solution):
     factors: Factors  # triangular factors of the fitted rows, base parameters
     determination: Determination  # which base parameters the fitted rows determine
     open_terms: tuple[OpenTerm, ...] = ()  # uncertain terms, in the covariance
+    repeated: Array | float = 0.0  # (p, p), covariance due to errors that torques repeat
     regressor_noise: RegressorNoise | None = None  # of position quantisation; or negligible
     runs: tuple[RunsOf, ...] = ()  # information of three or more logs on varying parameters
     sums: RunSums | None = None  # sums over their rows from which it is computed
@@ -426,7 +427,7 @@ def expected_band(fit: Fit, evaluation: Evaluation, between: Array | None = None
     """Return the torque band of a recording by the noise level of the fit; between (p, p)."""
     K, recording = fit.mapping.K, evaluation.recording
     moves = np.array([term.moves for term in fit.open_terms]).reshape(-1, K.shape[1])
-    C = fit.standard_covariance - moves.T @ moves
+    C = fit.standard_covariance - fit.repeated - moves.T @ moves
     covariance = K @ (C if between is None else C + between) @ K.T
 
     def errors(rows: Array) -> list[tuple[Array, Array]]:
@@ -434,7 +435,10 @@ def expected_band(fit: Fit, evaluation: Evaluation, between: Array | None = None
         torques = open_torques(model, fit.open_terms, recording, rows)
         return list(zip(moves @ K.T, torques, strict=True))
 
-    sigma = fit.estimate.sigma
+    sigma, basis = fit.estimate.sigma, recording.trajectory.basis
+    if basis is not None:  # noise that unknown forces can cause is no part of the rows
+        left, used = 1.0 - np.sum(basis**2, axis=2), recording.mask
+        sigma = sigma * np.sqrt(np.sum(left, axis=0, where=used) / np.maximum(used.sum(axis=0), 1))
     return torque_band(fit.model, fit.mapping, recording.trajectory, covariance, sigma, errors)
 
 

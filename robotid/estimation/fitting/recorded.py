@@ -125,7 +125,8 @@ class LogPiece:
             return self.source
         layout = self.source
         reader = open_table(Path(layout.path), layout.source).reader(layout.wanted)
-        log = _log_of(layout, reader.read(layout.wanted, *self.span, self.near), self.span[0])
+        log = layout.to_log(reader.read(layout.wanted, *self.span, self.near), self.span[0])
+        check_reach(log, layout.units, layout.prismatic, layout.turning)
         return with_contacts(self.model, closed_log(self.model, log), self.signals)
 
     def _read(self) -> Rows:
@@ -377,7 +378,7 @@ def survey_log(
     first, stop = rows_within(stamps, where, *window)
     ranges = _close_looks(first, stop)
     columns = [reader.read(wanted, i, j, _near(places, i)) for i, j in ranges]
-    windows = tuple(_log_of(layout, x, i) for x, (i, _) in zip(columns, ranges, strict=True))
+    windows = tuple(layout.to_log(x, i) for x, (i, _) in zip(columns, ranges, strict=True))
     layout, windows = _with_one_bias(layout, windows)
     for log in windows:
         check_units(log, layout.units, layout.prismatic, layout.turning)
@@ -410,13 +411,6 @@ def _with_one_bias(
         notes = tuple(note if x == note_of_window else x for x in log.notes)
         changed.append(replace(log, base=replace(base, imu=imu), notes=notes))
     return replace(layout, base=replace(layout.base, imu=frame)), tuple(changed)
-
-
-def _log_of(layout: LogLayout, columns: Mapping[str, Array], first: int) -> Log:
-    """Return rows of a file as a log in SI units, angles not unwrapped."""
-    log = layout.to_log(columns, first)
-    check_reach(log, layout.units, layout.prismatic, layout.turning)
-    return log
 
 
 def _unwrap(model: RobotModel, log: Log) -> Log:

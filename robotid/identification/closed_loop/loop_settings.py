@@ -37,7 +37,7 @@ class LoopSettings(Settings):
     )  # fmt: skip
     kd: PerJoint | None = setting(
         None, "speed gain [N m s/rad or N s/m]; default: part of the viscous friction, or fitted "
-        "if the logs have speed commands, torques, or own gains of a known ratio", **LEVEL,
+        "if the logs have speed commands, torques, or gains of a known ratio", **LEVEL,
     )  # fmt: skip
     limit: PerJoint | str | None = setting(
         None,

@@ -9,14 +9,13 @@ import numpy as np
 
 from robotid.base.files import finite, source_entry
 from robotid.base.settings import require_kind
-from robotid.base.typing import Array
 from robotid.base.versions import __version__, versions
 from robotid.data.signal_settings import Transmission
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.drive_terms import DriveChoice
 from robotid.estimation.fitting.evaluation import LEFT_OUT, Evaluated, Evaluation
 from robotid.estimation.fitting.fitted import SOURCES, Identified, next_errors
-from robotid.estimation.fitting.standard_errors import QUANTILE
+from robotid.estimation.fitting.standard_errors import QUANTILE, rms_error
 from robotid.identification.parameter_table import parameter_entries
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.output.files.ranges import covariance_entry, parameter_ranges
@@ -74,7 +73,9 @@ def build_result(
 
 
 def _torque_entries(found: TorqueIdentification, settings: Mapping[str, Any]) -> dict[str, Any]:
-    names = found.model.layout.names
+    names, covariances = found.model.layout.names, {"covariance": found.standard_covariance}
+    if np.any(found.repeated):
+        covariances["torque_covariance"] = found.standard_covariance - found.repeated
     return {
         "structure": _determined(found),
         "uncertainty": {
@@ -82,7 +83,7 @@ def _torque_entries(found: TorqueIdentification, settings: Mapping[str, Any]) ->
             "segments": found.errors.segments,
             "inflation": found.errors.inflation,
         },
-        "covariance": covariance_entry(names, found.standard_covariance, found.at_bound),
+        **{key: covariance_entry(names, C, found.at_bound) for key, C in covariances.items()},
         "motors": _motors(found, settings),
         "friction": {drive.joint: _friction(found, drive) for drive in found.drives},
         "consistency": {
@@ -199,15 +200,11 @@ def _determined(found: TorqueIdentification) -> dict[str, Any]:
 
 def _expected_torque(preview: "Preview") -> dict[str, dict[str, Any]]:
     """Return RMS torque and RMS half width of the 95 % band of each joint on the motions."""
-    found, bands = preview.expected, preview.bands
-
-    def rms_of(parts: list[Array]) -> Array:
-        return np.asarray(np.sqrt(np.mean(np.vstack(parts) ** 2, axis=0)))
-
-    rms = rms_of([e.recording.trajectory.tau for e in found.fitted])
-    of_parameters = QUANTILE * rms_of([band.parameters for band in bands])
-    half = QUANTILE * rms_of([band.total for band in bands])
-    model = found.model
+    found, bands, model = preview.expected, preview.bands, preview.expected.model
+    tau = np.vstack([e.recording.trajectory.tau for e in found.fitted])
+    rms, half = np.sqrt(np.mean(tau**2, axis=0)), QUANTILE * rms_error(bands)
+    alone = [dataclasses.replace(band, noise=0.0 * band.noise) for band in bands]
+    of_parameters = QUANTILE * rms_error(alone)
     return {
         row: {
             "rms": float(rms[j]),

@@ -183,10 +183,11 @@ class Result:
         """Return the encoder readings simulated on a log's commands, (N, n) [rad or m]."""
         if not self.commanded:
             raise DataError(
-                f"{self.path.name} has no gains of drives, which a simulation on commands requires"
+                f"{self.path.name} has no gains of drives, which a simulation on commands "
+                "requires; identify from a log with commands"
             )
         if log.q_ref is None:
-            raise DataError(f"{log.name} has no commands, columns qref_ of each joint")
+            raise DataError(f"{log.name} has no commands, columns qref_ of each joint; log them")
         return self._signs * self.open_loop(log, horizons=()).q
 
     def open_loop(
@@ -401,10 +402,10 @@ def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:
 
 
 def stated_covariance(result: Mapping[str, Any], names: Sequence[str]) -> Array | None:
-    """Return the covariance of parameters of a result; None if an earlier version wrote it."""
+    """Return the covariance of parameters in torques; None if an earlier version wrote it."""
     if "covariance" not in result:
         return None
-    stated = result["covariance"]
+    stated = result.get("torque_covariance", result["covariance"])
     require_lengths(stated["root"], [len(stated["names"])], "covariance.root")
     rows = dict(zip(stated["names"], stated["root"], strict=True))
     root = np.zeros((len(names), max(map(len, rows.values()), default=0)))

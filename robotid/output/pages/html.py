@@ -26,6 +26,7 @@ TONES = 8  # distinguishable colours of lines in one chart: tone-1 to tone-8
 POINTS = 2000  # rows of a chart's data
 _AROUND = 112  # [px] of caption, axis and legend of each chart in a notebook
 _STYLE = "main { padding: .5rem 1rem; } h1 { font-size: 1.125rem; margin: 0 0 .5rem; }"
+_UNBROKEN = 16  # characters of a name that always stays on one line
 _FIRST = 3  # reasons of a verdict that are visible without unfolding
 _KINDS = {"urdf": "URDF", "sidecar": "drive parameters"}  # of files, by key of result.json
 _DOCK = '<div id="replay" class="dock"'
@@ -64,7 +65,7 @@ class Cell:
     """One cell of a table."""
 
     html: str  # escaped
-    kind: str = ""  # style: "" for prose, "text" for short texts, "number", "code", "flag"
+    kind: str = ""  # style: "" for prose, "text" for short texts, "number", "code"; "flag" in red
     value: float | None = None  # the number in full precision
 
 
@@ -79,16 +80,16 @@ class Section(NamedTuple):
 
 def text(value: str, *, flag: bool = False) -> Cell:
     """Return a cell of text."""
-    return Cell(escape(value), "flag" if flag else "text" if len(value) < 24 else "")
+    short = "text" if len(value) < 24 else ""
+    return Cell(escape(value), f"flag {short}".strip() if flag else short)
 
 
 def code(value: str) -> Cell:
     """Return a cell for names, hashes and formulas."""
     # long names and formulas may break after a dot, an underscore or a slash only
     html = escape(value)
-    for mark in (".", "_", "/"):
-        html = html.replace(mark, f"{mark}<wbr>")
-    return Cell(html, "code")
+    is_long = len(value) > _UNBROKEN
+    return Cell(re.sub("([._/])", r"\1<wbr>", html) if is_long else html, "code")
 
 
 def number(value: float | None, spec: str = ".4g") -> Cell:
@@ -121,8 +122,8 @@ def with_error(value: float, error: float, *, sign: str = "") -> tuple[Cell, Cel
     exponent = int(f"{error:.1e}".partition("e")[2])  # of the first digit of the rounded error
     size = math.floor(math.log10(abs(value))) if value else exponent
     if max(size, exponent) < -3 or exponent > 4:
-        digits = max(size - exponent + 1, 0)
-        return number(value, f"{sign}z.{digits}e"), number(error, ".1e")
+        form = f"z.{max(size - exponent + 1, 0)}e" if abs(value) > 1e-3 * error else "z.0f"
+        return number(value, sign + form), number(error, ".1e")
     decimals = max(1 - exponent, 0)
     return number(value, f"{sign}z.{decimals}f"), number(error, f".{decimals}f")
 

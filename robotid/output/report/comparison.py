@@ -425,7 +425,7 @@ def fleet_page(content: Mapping[str, Any]) -> str:
     sections = {
         "units": ("Units", _units(content)),
         "unlike": ("Units that differ", _unlike(content)),
-        "parameters": ("Variation between units", _parameters(content)),
+        "parameters": ("Variation between units", _parameters(content), "by parameter", False),
         "values": ("Distributions", _distributions(content), "units by parameter", False),
     }
     title = f"Fleet of {content['units']} units"

@@ -97,9 +97,8 @@ def _limit_table(model: RobotModel, content: Mapping[str, Any], course: Course) 
                  "unit": units[k]}
             )  # fmt: skip
     table = listing("Largest use of each limit", _COLUMNS, rows)
-    return block("motion.limits", share=f"{100 * content['share']:.0f}", table=table) + _collisions(
-        content, course
-    )
+    used = block("motion.limits", share=f"{100 * content['share']:.0f}", table=table)
+    return used + _collisions(content, course)
 
 
 def _collisions(content: Mapping[str, Any], course: Course) -> str:
@@ -132,7 +131,7 @@ def _over_time(model: RobotModel, content: Mapping[str, Any], course: Course) ->
         joints, free = np.flatnonzero(is_limited), np.flatnonzero(~is_limited)
         if len(joints):
             bound = np.full(len(course.t), 100.0)
-            edges = [Series("limit", bound, "text"), Series("−limit", -bound, "text")]
+            edges = [Series("limit", bound, "text"), Series("limit", -bound, "text")]
             series = (*edges, *_lines(model, 100.0 * course.used[k], joints))
             title = f"{kind} of each joint relative to its limit"
             chart = Chart(title, course.t, series, "time [s]", "% of the limit", "time")

@@ -94,8 +94,10 @@ def page_of(found: Identification, report: Report, origin: Origin, files: Mappin
     """Return the HTML of the report."""
     rows, verdicts = found.model.row_names, found.verdict.to_dict()["per_joint"]
     definition, after = report.errors
-    every = errors_of(found)
-    shown = "".join(tables.error_table(report.quantity, x, rows, verdicts) for x in every)
+    *validation, fitted = errors_of(found)
+    of_fitted = {} if validation else verdicts  # a verdict is on the validation logs, if any
+    shown = "".join(tables.error_table(report.quantity, x, rows, verdicts) for x in validation)
+    shown += tables.error_table(report.quantity, fitted, rows, of_fitted)
     count = sum(entry["source"] in ("data", "mixed") for entry in report.entries)
     determined = f"{count} of {len(report.entries)} determined by the data, fully or partly"
     parts = report.appendix.items()
@@ -421,7 +423,7 @@ def _torque_method(found: TorqueIdentification) -> str:
     fitted, validation = found.fitted, found.validation
     samples = sum(e.recording.extent.smooth for e in fitted)
     rows = sum(e.recording.extent.rows_used for e in fitted)
-    chains = sorted({_chain(e.recording.signals) for e in (*fitted, *validation)})
+    chains = _chains(e.recording.signals for e in (*fitted, *validation))
     left_out = left_out_lines([metrics.to_dict() for metrics in found.left_out.values()])
     others = "; ".join(["There is no validation log", *left_out])
     if validation:
@@ -430,19 +432,20 @@ def _torque_method(found: TorqueIdentification) -> str:
         f"{len(found.base)} base parameters of {len(found.model.joints)} joints were fitted to "
         f"{listed(e.name for e in fitted)} ({samples} samples after filtering, {rows} torque "
         f"values used) by {found.estimator.words} ({found.estimator.name}). {others}. Signals: "
-        f"{'; or '.join(chains)}."
+        f"{chains}."
     )
 
 
-def _chain(signals: SignalSettings) -> str:
-    cutoff = "no filter"
-    if signals.cutoff is not None:
-        cutoff = (
-            f"zero-phase Butterworth low-pass, cut-off {signals.cutoff:g} Hz, order "
-            f"{signals.order} run forward and backward"
-        )
-    rate = f"grid of {signals.rate:.6g} Hz" if signals.rate else "samples as recorded"
-    return f"{cutoff}, {rate}, velocity {signals.velocity}"
+def _chains(settings: Iterable[SignalSettings]) -> str:
+    rates = dict[str, dict[str, None]]()  # by the other settings, which most logs share
+    for x in settings:
+        order = f"order {x.order} run forward and backward"
+        low_pass = f"zero-phase Butterworth low-pass, cut-off {x.cutoff or 0:g} Hz, {order}"
+        rate = f"grid of {round(x.rate, 1):g} Hz" if x.rate else "samples as recorded"
+        rates.setdefault(f"{low_pass if x.cutoff else 'no filter'}, velocity {x.velocity}", {})[
+            rate
+        ] = None
+    return "; or ".join(f"{chain}, {' or '.join(same)}" for chain, same in rates.items())
 
 
 def _torques(found: TorqueIdentification, worst: str, origin: Origin, replay: str) -> str:

@@ -36,8 +36,8 @@ _END = 100  # [%] end of the linear axis of the bars; larger errors end there, t
 _TICKS = range(0, _END + 1, 20)  # [%]
 _COLUMNS = (
     ("joint", "code", "joint"), ("error %", "%", "relative_error_pct"),
-    ("verdict", "text", "verdict"), ("RMSE", ".3g", "rmse"), ("unit", "text", "unit"),
-    ("R²", ".3f", "r2"), ("samples", "d", "rows"),
+    ("RMSE", ".3g", "rmse"), ("unit", "text", "unit"), ("R²", ".3f", "r2"),
+    ("samples", "d", "rows"),
 )  # fmt: skip
 _UNKNOWN = {"status": "not evaluated", "reasons": ()}
 
@@ -231,20 +231,18 @@ def error_table(
     known = [key for key in others if any(m.get(key) is not None for m in errors.joints.values())]
     entries = []
     for joint in rows:
-        measured, status = errors.joints.get(joint), "–"
-        if joint in verdicts:
-            status = verdict_cell(joint, verdicts[joint])
-        entry: dict[str, Any] = {"joint": joint, "verdict": f"{status}; no samples used"}
+        measured, entry, notes = errors.joints.get(joint), dict[str, Any](), ["no samples used"]
+        status = verdict_cell(joint, verdicts[joint]) if joint in verdicts else ""
         if measured is not None:
             notes = [note for note in _notes(measured) if note not in status]
-            is_flagged = bool(notes) or status.startswith("poor")
-            entry |= dict(measured) | {
-                "verdict": text("; ".join([status, *notes]), flag=is_flagged),
-                "rmse": measured["rmse"] / quantity.scale,
-                "unit": f"{quantity.prefix}{measured['unit']}",
-            }
-        entries.append(entry)
+            rmse, unit = measured["rmse"] / quantity.scale, f"{quantity.prefix}{measured['unit']}"
+            entry = {**measured, "rmse": rmse, "unit": unit}
+        is_flagged = bool(measured and notes) or status.startswith("poor")
+        note = text("; ".join(filter(None, [status, *notes])), flag=is_flagged)
+        entries.append({**entry, "joint": joint, "note": note})
     columns = [*_COLUMNS, *((f"{others[key]} %", "%", key) for key in known)]
+    if any(entry["note"].html for entry in entries):
+        columns.insert(2, ("verdict" if verdicts else "note", "text", "note"))
     return listing(errors.caption, columns, entries, is_data=True)
 
 

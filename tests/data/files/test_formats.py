@@ -156,10 +156,9 @@ def test_suffixes_of_formats_are_known_in_any_case(tmp_path):
         ".bag, or the folder of a ROS 2 bag or of a LeRobot dataset; convert it"
     ):
         read_log(tmp_path / "run.xlsx", ["a"])
-    for name, suffix in (("run", ""), ("run.mcap", ".mcap")):
-        with refused(
-            f"{name}: logs are written as {', '.join(WRITTEN[:-1])} or .mat files, not {suffix!r}"
-        ):
+    written = f"logs are written as {', '.join(WRITTEN[:-1])} or .mat files"
+    for name, found in (("run", "but the name has no extension"), ("run.mcap", "not '.mcap'")):
+        with refused(f"{name}: {written}, {found}"):
             write_log(sine_log(), tmp_path / name)
     write_log(sine_log(), tmp_path / "run.csv")
     path = (tmp_path / "run.csv").rename(tmp_path / "RUN.CSV")

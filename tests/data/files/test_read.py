@@ -169,12 +169,12 @@ REFUSED = {
     "resting joint without torque": (
         dict(tau_elbow=None, q_elbow=ONE), {}, "If elbow was at rest, lock it at its position, as "
         "--lock elbow=0, or locked = { elbow = 0 } in the job file$"),
-    "no positions": (NO_Q, {}, "no columns 'q_shoulder', 'q_elbow'; position columns found: none. "
-                     "Record the position of each joint$"),
-    "no torques": (NO_TAU, {}, "torque or current columns found: none. Record tau_<joint> or "
-                   "current_<joint>. Commanded positions, qref_<joint>, are enough for"),
-    "other columns": (NO_TAU | dict(M1=ONE), {}, 'Other columns: M1. ', "Rename the columns, or "
-                      'set them in the job file:\n[columns]\ntime = "time"\nq_shoulder = "q_sh',
+    "no positions": (NO_Q, {}, "no columns 'q_shoulder', 'q_elbow'; no position columns were "
+                     "recognised. Record the position of each joint$"),
+    "no torques": (NO_TAU, {}, "no torque or current columns were recognised. Record tau_<joint> "
+                   "or current_<joint>. Commanded positions, qref_<joint>, are enough for"),
+    "other columns": (NO_TAU | dict(M1=ONE), {}, 'Other columns: M1. ', "If the log has other "
+                      'names for them, set these in the job file:\n[columns]\ntime = "time"\nq_sh',
                       '# tau_elbow = "NAME"$'),
     "misspelt": (dict(q_elbow=None, q_elbow2=ONE), {}, '\nq_elbow = "q_elbow2"  # by order$'),
     "no time": (dict(time=None, Clock=T), {}, "log has no column 'time'; columns found: q_shoulder"
@@ -211,14 +211,14 @@ REFUSED = {
     "far": (dict(q_elbow=20 * LOG.q[:, 1]), {}, "q_elbow reaches 20, which looks like degrees"),
     "outside": ({}, dict(start=2000.0), "0 rows lie between 2000 s", "the log spans 1000 s to 100"),
     "needs": ({}, dict(needs="everything"), "is 'everything', expected one of torque, motion"),
-    "no commands": ({}, dict(needs="commands"), "commanded position columns found: none. Record the"
-                    " commands of the controller"),
+    "no commands": ({}, dict(needs="commands"), "; no commanded position columns were recognised. "
+                    "Record the commands of the controller"),
     "half a command": (dict(qref_elbow=ONE, q_shoulder=ONE), dict(needs="commands"), "no column "
                        "'qref_shoulder'; commanded position columns found: qref_elbow. If shoulde"),
     "commands only": (NO_TAU | of("qref", LOG.q), {}, "All estimators but the simulation need tau_",
                       "by --estimator simulation --kp N_M_PER_RAD", "kp = N_M_PER_RAD  # position"),
-    "sizes of loads": (NO_TAU | of("loadsize", LOG.q), {}, "none. Loads without sign, which are no "
-                       "torques: loadsize_sh"),
+    "sizes of loads": (NO_TAU | of("loadsize", LOG.q), {}, "recognised. Loads without sign, which "
+                       "are no torques: loadsize_sh"),
     "motors": (NO_TAU | dict(taum_a=ONE), {}, "For columns of motors, as taum_a, add [[transmis"),
 }  # fmt: skip
 
@@ -256,7 +256,7 @@ def test_commanded_columns_are_no_torques(kind):
     with pytest.raises(DataError) as caught:
         read_log(frame(**NO_TAU, **of(kind, LOG.q)), JOINTS)
     names = f"{kind}_shoulder, {kind}_elbow"
-    assert f"found: none. Commanded, not measured: {names}. Record tau_" in str(caught.value)
+    assert f"were recognised. Commanded, not measured: {names}. Record tau_" in str(caught.value)
     assert "[columns]" not in str(caught.value)
 
 

@@ -329,9 +329,8 @@ def test_rate_and_jitter_are_those_of_the_steps():
         "rate": pytest.approx(100.0), "samples": 901, "duration": pytest.approx(9.0)
     }  # fmt: skip
     assert found["rate"].message.startswith("run.csv: the log has 901 rows in 9 s, median rate 100")
-    spread = np.sqrt(2.0 / 3.0) * 0.2
     assert Figures(found["jitter"]) == {
-        "relative_spread": pytest.approx(spread),
+        "relative_spread": pytest.approx(np.sqrt(2.0 / 3.0) * 0.2),
         "shortest": pytest.approx(0.008),
         "longest": pytest.approx(0.012),
     }
@@ -347,7 +346,8 @@ def test_gaps_are_counted_and_the_longest_has_its_time():
     # before it, 300 steps of which one is a gap of 40 ms in place of 8
     at = START + 300 * 0.01 + 0.032
     assert Figures(gap) == {"gaps": 3, "longest": pytest.approx(0.5), "at": pytest.approx(at)}
-    assert gap.message.startswith("run.csv: the log has 3 gaps, the longest of 0.5 s at t = 6.032")
+    words = "run.csv: the time stamps have gaps (3). The longest, at t = 6.032 s, lasts 0.5 s. "
+    assert gap.message.startswith(words)
     # a gap has no part in the jitter
     assert found["jitter"].evidence["longest"] == pytest.approx(0.012)
     short = said(check_clock(clocked_log(stamps((100, 0.04)))))["gap"]

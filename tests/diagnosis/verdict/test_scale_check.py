@@ -72,7 +72,7 @@ def test_torques_of_another_gain_are_told_from_other_masses_and_never_good(four)
     assert found.scale_check.factor == pytest.approx(0.8, abs=0.01)
     assert found.scale_check.has_one_factor
     assert found.verdict.status == "usable"
-    (reason,) = [r for r in found.verdict.reasons if "absolute scale not verified" in r]
+    (reason,) = [r for r in found.verdict.reasons if "absolute scale contradicts the URDF" in r]
     assert "The same factor 0.80 fits all joints: check the gains" in reason
 
 
@@ -93,8 +93,8 @@ def test_a_load_without_mass_confirms_no_scale(factor, mass, contradicts):
     check = ScaleCheck(scale=1.01, factor=factor, masses=(20.0, mass, 0.0), unexplained=(0.2, 0.01))
     assert not check.agrees
     assert check.contradicts is contradicts
-    assert "absolute scale not verified" in check.message
-    said = check.message
+    said, state = check.message, "contradicts the URDF" if contradicts else "not verified"
+    assert said.startswith(f"absolute scale {state}: ")
     assert f"gravity torque {factor:.2f} x the URDF's, total mass {mass:.4g} kg" in said
     assert replace(check, factor=1.05 - 1e-9, masses=(20.0, 20.8, 0.0)).agrees
     assert replace(check, factor=1.05 + 1e-9, masses=(20.0, 20.8, 0.7)).agrees

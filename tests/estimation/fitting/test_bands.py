@@ -190,15 +190,15 @@ def test_the_band_of_a_recording_has_each_open_term_with_what_it_moves(rng):
     motion = Trajectory(np.arange(9) / 50, q, v, a, tau, JOINTS, 50.0, np.zeros(9, dtype=int))
     mapping, size = structural_mapping(model), model.layout.n_inertial
     standard = model.standard_parameters() * rng.uniform(0.5, 2.0, len(model.layout.names))
-    root, moves = rng.standard_normal((40, len(standard))), rng.standard_normal((2, len(standard)))
+    root, moves, again = (rng.standard_normal((k, len(standard))) for k in (40, 2, 3))
     own = [
         OpenTerm(LIFT, moves[0], lambda drive, alone: drive.v**3 + alone.a),
         OpenTerm(WRIST, moves[1], lambda drive, alone: drive.load * alone.others[ELBOW].q),
     ]
     found = SimpleNamespace(
         model=model, mapping=mapping, standard=standard, open_terms=tuple(own),
-        standard_covariance=root.T @ root + moves.T @ moves,
-        estimate=SimpleNamespace(sigma=np.array([3.0, 1.0, 0.5])),
+        standard_covariance=root.T @ root + moves.T @ moves + again.T @ again,
+        estimate=SimpleNamespace(sigma=np.array([3.0, 1.0, 0.5])), repeated=again.T @ again,
     )  # fmt: skip
     recording = SimpleNamespace(trajectory=motion, signals=SignalSettings(cutoff=5.0))
     evaluation = object.__new__(Evaluation)

@@ -99,14 +99,14 @@ def test_a_bad_sample_is_refused_without_harm(ur5, rng):
     bad = np.full(6, np.nan)
     for k in range(len(log.t)):
         disturbed.update(log.t[k], log.q[k], log.tau[k])
-        with pytest.raises(DataError, match="is not finite, so it was refused"):
+        with pytest.raises(DataError, match="is not finite; leave it out"):
             disturbed.update(log.t[k] + 1e-3, bad, log.tau[k])
     np.testing.assert_array_equal(disturbed.reading.theta, clean.reading.theta)
     with pytest.raises(DataError, match=r"update takes \(t, q, tau\) or .* found 4 values"):
         clean.update(9.0, log.q[0], log.q[0], log.q[0])
     with pytest.raises(DataError, match="t must increase"):
         clean.update(log.t[-1], log.q[0], log.q[0], log.q[0], log.tau[0])
-    with pytest.raises(DataError, match="is not finite, so it was refused"):
+    with pytest.raises(DataError, match="is not finite; leave it out"):
         clean.update(9.0, log.q[0], bad, log.q[0], log.tau[0])
     with pytest.raises(DataError, match=r"expected \(6,\) each"):
         clean.update(9.0, log.q[0], bad[:5], log.q[0], log.tau[0])

@@ -309,7 +309,8 @@ def test_a_small_error_of_a_plain_number_is_written_in_full():
     for value, error, wanted in (
         (1.5, 1.2e-5, ("1.500000", "0.000012")), (0.00123, 2e-4, ("0.00123", "0.00020")),
         (1.5e-4, 0.0012, ("0.0001", "0.0012")), (2e-4, 3e-4, ("2.0e−04", "3.0e−04")),
-        (-1.5e6, 9.94e4, ("−1500000", "99400")), (-1.5e6, 1.2e5, ("−1.50e+06", "1.2e+05")),
+        (-1e-8, 3e-4, ("0", "3.0e−04")), (-1.5e6, 9.94e4, ("−1500000", "99400")),
+        (-1.5e6, 1.2e5, ("−1.50e+06", "1.2e+05")),
     ):  # fmt: skip
         assert tuple(cell.html for cell in with_error(value, error)) == wanted
 
@@ -317,8 +318,9 @@ def test_a_small_error_of_a_plain_number_is_written_in_full():
 def test_a_cell_has_the_style_of_its_content_and_its_number_in_full():
     for cell, wanted in (
         (text("<" * 23), ("&lt;" * 23, "text", None)), (text("a" * 24), ("a" * 24, "", None)),
-        (text("a", flag=True), ("a", "flag", None)),
-        (code("a.b_c/<"), ("a.<wbr>b_<wbr>c/<wbr>&lt;", "code", None)),
+        (text("a", flag=True), ("a", "flag text", None)),
+        (code("a.b_c/<" + 10 * "d"), ("a.<wbr>b_<wbr>c/<wbr>&lt;dddddddddd", "code", None)),
+        (code("wrist_1_joint/<_"), ("wrist_1_joint/&lt;_", "code", None)),
         (number(-12.3456), ("−12.35", "number", -12.3456)), (number(None), ("–", "number", None)),
         (number(np.nan), ("–", "number", None)), (number(2.0, "+.2f"), ("+2.00", "number", 2.0)),
         (percent(1000.4), ("1000", "number", 1000.4)),

@@ -89,15 +89,12 @@ def test_each_parameter_has_its_figures_and_what_one_more_log_would_change(varia
     ]  # fmt: skip
     assert rows[1][4:7] == ["3.0", "2.0", "4.0"]
     assert rows[1][-2:] == ["95", "99"]
-    assert (
-        page.count("<strong>6.00 ± 0.30</strong>")
-        == page.count('<td class="number" data-value="6"><strong>')
-        == 1
+    bold = "<strong>6.00 ± 0.30</strong>"
+    assert page.count(bold) == page.count(f'<td class="number" data-value="6">{bold}') == 1
+    next_error = (
+        "RMS torque error of the next log, on motions like these: one 1.23 N m, two 0.4 N m"
     )
-    assert (
-        "Expected RMS torque error of the next log, on motions like these: one 1.23 N m, two "
-        in page
-    )
+    assert f"Expected {next_error}" in page
     robots = variation_section(replace(variation, units=3), {})
     assert "95 % of the next robot (after 3)</caption>" in robots
     assert "standard deviation between robots (spread)" in robots

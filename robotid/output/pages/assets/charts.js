@@ -3,11 +3,14 @@
 // the legend, and links: charts of one link share cursor and zoom.
 window.charts = (() => {
 const BAND = 0.2, AREA = 0.7, FAINT = 0.5, GROUND = 0.09; // opacities
+const MARGIN = 300; // [px] about the window in which charts count as in sight
 const CLOSER = 0.5; // zoom factor of a key
 const HINT = "Arrow keys move the cursor, plus and minus zoom, Escape shows all, digits hide lines.";
 const STEPS = Array.from({ length: 24 }, (_, k) => [1, 2, 5].map((x) => x * 10 ** (k - 12))).flat();
 const all = [];
-const idle = window.requestIdleCallback || ((act) => setTimeout(act, 30));
+const idle = (act) => { // a busy browser is idle at last
+  if (window.requestIdleCallback) requestIdleCallback(act, { timeout: 300 }); else setTimeout(act, 30);
+};
 
 function element(tag, attributes = {}, ...children) {
   const made = document.createElement(tag);
@@ -115,7 +118,7 @@ const sight = new IntersectionObserver((entries) => {
     const chart = all.find((one) => one.place === target);
     if (chart) chart.see(isIntersecting);
   }
-}, { rootMargin: "300px" });
+}, { rootMargin: `${MARGIN}px` });
 
 class Chart { // what: as charts.py says; x, y and half are arrays, NaN where there is no number
   constructor(parent, what, shared = null) {
@@ -298,7 +301,8 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
       axes: [axis({ size: 28, label: name || null, labelSize: name ? 20 : 0, labelGap: 2,
         space: (u, i, low, high) => 36 + 7 * String(Math.trunc(high)).length,
         labelFont: "11px system-ui, sans-serif", ...decades("x") }),
-      axis({ size: 54, space: 22, ...decades("y") })],
+      // at least two labels: steps of ticks differ by at most 2.5, and a range is twice as long as its half
+      axis({ size: 54, space: Math.min(22, height / 5.5), ...decades("y") })],
       series: [{}, ...series.map(({ tone: colour, kind, is_weak: weak }, i) => ({ show: !this.hidden.has(i),
         stroke: () => tone(colour), width: 1.3, alpha: weak ? FAINT : 1, points: { show: false },
         ...(kind === "line" ? {} : { paths: () => null }) }))],
@@ -488,6 +492,11 @@ for (const figure of document.querySelectorAll("figure.chart")) {
   }
   new Chart(figure, what, legend(figure.closest(".plots")));
 }
+
+// charts in sight are drawn with the page; one layout gives all places
+const unfolded = all.filter((chart) => !chart.live.closest("details:not([open])"));
+const tops = unfolded.map((chart) => chart.place.getBoundingClientRect().top);
+unfolded.forEach((chart, k) => { if (tops[k] < innerHeight + MARGIN) chart.see(true); });
 
 // charts out of sight are drawn when the browser is idle, one at a time; folded ones wait
 function drawNext() {

@@ -292,10 +292,11 @@ function castShadow() { // below the lowest point of each ellipsoid, darker the 
 // ---- camera ----------------------------------------------------------------------------------
 
 const base = [0, 0, 0]; // where a floating base is, 0 if it is fixed
-const middle = [0, 1, 2].map((k) => { // of the points that must be in sight
-  const along = data.view.points.map((point) => point[k]);
-  return (Math.min(...along) + Math.max(...along)) / 2;
-});
+const [middle, spans] = [(low, high) => (low + high) / 2, (low, high) => high - low].map((of) =>
+  [0, 1, 2].map((k) => { // of the points that must be in sight
+    const along = data.view.points.map((point) => point[k]);
+    return of(Math.min(...along), Math.max(...along));
+  }));
 let follows = floats, isTurned = false; // by hand: the view then remains when the window changes
 // the viewer's camera has y upwards: (x, y, z) of the robot is (x, z, -y) there
 const upward = ([x, y, z]) => new THREE.Vector3(x, z, -y);
@@ -303,10 +304,12 @@ const upward = ([x, y, z]) => new THREE.Vector3(x, z, -y);
 const TALL = Math.tan((20 * Math.PI) / 180); // of half the view's angle
 const FILLED = 0.9; // share of the view
 const AZIMUTHS = [35, 60, -35, -60]; // [degrees] from the front; the first, unless another is closer
+// height of the camera over its distance along the ground: larger for a motion that is flat, as of a planar arm
+const RISE = 0.39 + 1.2 * Math.max(0, 1 - (3 * spans[2]) / Math.max(spans[0], spans[1]));
 
 function framed(azimuth) { // the nearest camera of a direction with all points in sight
   const turn = (azimuth * Math.PI) / 180, up = new THREE.Vector3(0, 1, 0);
-  const away = new THREE.Vector3(Math.cos(turn), 0.39, Math.sin(turn)).normalize();
+  const away = new THREE.Vector3(Math.cos(turn), RISE, Math.sin(turn)).normalize();
   const right = up.clone().cross(away).normalize();
   up.copy(away).cross(right);
   const [x, y, z] = [right, up, away].map((axis) =>
