@@ -2,7 +2,7 @@
 
     ROBOTID_DATA=folder python benchmarks/bench_commands.py [--quick] [--out FOLDER]
         [--go2] [--so101] [--arms] [--rollouts] [--coverage RUNS [--with-torque] [--driven]]
-        [--held RUNS [--bits BITS]]
+        [--held RUNS [--bits BITS ...]]
 
 Without a part named, roll-outs and 20 runs of coverage. --go2: fitted to the first 14.09 s of a
 chirp of twelve joints, beside mujoco.sysid on the same bodies, which starts its roll-out of the
@@ -11,10 +11,11 @@ plain baseline of the recording's description. --arms: recordings without comman
 drives the robot: torque rows alone, simulations alone, both, each with viscous and Coulomb friction
 and offset; and the last with what friction other windows confirm. The simulated arm is MuJoCo's,
 16 kHz, written at 100 Hz, its torque with noise of 1 % of its size, encoders of 0.05 mrad.
---coverage: MuJoCo simulates a robot with known
-drives on a multi-sine of 10 s at 500 Hz, at a step of 0.05 ms and with stiff friction, encoders
-with noise of 0.3 mrad; gains are stated, bodies are those of the URDF. --driven: again without
-commands, the torque drives: logs as of the simulated arm at 250 Hz, the noise 5 %.
+--coverage: MuJoCo simulates a robot with known drives on a multi-sine of 10 s at 500 Hz, at a step
+of 0.05 ms and with stiff friction, encoders with noise of 0.3 mrad; gains are stated, bodies are
+those of the URDF. --with-torque instead: nothing is stated, bodies differ from the URDF, without
+and with logged torques. --driven: again without commands, the torque drives: logs as of the
+simulated arm at 250 Hz, the noise 5 %.
 --held: the planar arm and the leg, a plant of 0.1 ms with commands held for 4 ms, logged at 250 Hz,
 positions rounded to the steps of an encoder, one delay of the robot. Times are of the processor,
 all threads together, where they do not say otherwise: other loads of the machine add little.
@@ -109,7 +110,9 @@ def main():
         "--robots", nargs="+", default=["planar", "leg", "arm"], help="for --coverage"
     )
     parser.add_argument(
-        "--with-torque", action="store_true", help="for --coverage, also with logged torques"
+        "--with-torque",
+        action="store_true",
+        help="for --coverage, all unknown, without and with torques",
     )
     parser.add_argument(
         "--driven", action="store_true", help="for --coverage, also with the logged torque as input"
@@ -538,8 +541,9 @@ def coverage(
     for name, bit in itertools.product(robots, bits):
         how = {} if bit is None else {"run": held_run, "bits": bit}
         label = name if bit is None else f"{name}, {bit} bits"
-        rows += coverage_rows(label, covered(name, runs, seconds, **how))
-        if with_torque:
+        if not with_torque:
+            rows += coverage_rows(label, covered(name, runs, seconds, **how))
+        else:
             alone = covered(name, runs, seconds, finds_all=True)
             rows += coverage_rows(f"{name}, all unknown", alone)
             both = covered(name, runs, seconds, finds_all=True, torque=True)

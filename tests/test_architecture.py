@@ -155,7 +155,7 @@ def test_help_and_imports_load_no_more_than_they_need():
         "import robotid.estimation.estimators": "pinocchio",
         "import robotid.cli.logs, robotid.output.files.entries\n"
         "import robotid.estimation.fitting.recorded": f"{slow} scipy.interpolate",
-        "from robotid import *": f"{heavy} trimesh",
+        "from robotid import *": f"{heavy} trimesh scipy.interpolate scipy.optimize",
     }
     code = "import sys\nfrom contextlib import suppress\n" + "\n".join(
         f"{step}\nprint([m for m in {names.split()} if m in sys.modules], file=sys.stderr)"

@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from robotid.base.cores import available_cores
 from robotid.base.exceptions import DataError, RobotIdError, SettingsError
 from robotid.base.files import (
     check_folder,
@@ -36,7 +37,6 @@ from robotid.cli.job import (
     stated_path,
 )
 from robotid.data.files.parquet_files import read_text_table, write_rows
-from robotid.dynamics.factors import available_cores
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.estimation.variation.groups import FEWEST_RUNS
 from robotid.estimation.variation.variation import FALSE_ALARMS, between_units

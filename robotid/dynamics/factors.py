@@ -7,24 +7,20 @@ copies nothing and releases the interpreter's lock. Without it, SciPy's wrapper 
 """
 
 import ctypes
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from itertools import chain, pairwise
-from typing import TypeAlias, TypeVar
+from typing import TypeAlias
 
 import numpy as np
 import scipy.linalg.cython_lapack
 import scipy.linalg.lapack
 
+from robotid.base.cores import in_order
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
-
-ItemT = TypeVar("ItemT")
-ResultT = TypeVar("ResultT")
 
 _PART = 16384  # samples per part: merging costs little, and there are enough parts for threads
 PANEL = 8  # columns eliminated at a time: measured fastest for 20 to 70 columns ...
@@ -103,13 +99,10 @@ class Problem:
             for W, tau, weight in self.blocks():
                 yield W[:, columns], tau, weight
 
-        names, sources = tuple(self.names[i] for i in columns), self.sources
+        names = tuple(self.names[i] for i in columns)
+        sources = tuple(source.select(columns) for source in self.sources)
         return replace(
-            self,
-            stream=stream,
-            names=names,
-            support=self.support[:, columns],
-            sources=tuple(source.select(columns) for source in sources),
+            self, stream=stream, names=names, support=self.support[:, columns], sources=sources
         )
 
 
@@ -347,29 +340,6 @@ def join_segments(reductions: Iterable[Reduction], count: int, most: int) -> lis
     return segments
 
 
-def available_cores() -> int:
-    """Return the number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def in_order(
-    work: Callable[[ItemT], ResultT],
-    items: Sequence[ItemT],
-    *,
-    is_parallel: bool = True,
-    threads: int | None = None,
-) -> Iterator[ResultT]:
-    """Yield the result of work for each item in order, with threads where that is faster."""
-    most = (available_cores() if is_parallel else 1) if threads is None else threads
-    if (workers := min(most, len(items))) <= 1:
-        yield from map(work, items)
-        return
-    with ThreadPoolExecutor(workers) as pool:
-        yield from pool.map(work, items)
-
-
 class Triangle:
     """A triangular factor into which rows are folded, in place: it is the innermost loop."""
 
@@ -442,8 +412,7 @@ def _fold_blocks(
     triangles: Sequence[Triangle], columns: Sequence[Array], problem: Problem
 ) -> Array:
     """Fold whole blocks into the factors; return the number of rows per joint."""
-    n = problem.n_joints
-    rows = np.zeros(n, dtype=int)
+    n, rows = problem.n_joints, np.zeros(problem.n_joints, dtype=int)
     for W, tau, weight in problem.blocks():
         by_joint, torque = W.reshape(-1, n, W.shape[1]), tau.reshape(-1, n)
         root = np.sqrt(weight).reshape(-1, n)

@@ -25,10 +25,10 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, TypeAlias
 
 from threadpoolctl import threadpool_limits
 
+from robotid.base.cores import available_cores
 from robotid.base.exceptions import MissingDependencyError, SettingsError, WorkerError
 from robotid.base.typing import ProgressCallback, ignore_progress
 from robotid.base.versions import code_versions
-from robotid.dynamics.factors import available_cores
 
 if TYPE_CHECKING:
     from distributed import Client

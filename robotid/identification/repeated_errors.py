@@ -22,7 +22,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
-from scipy.optimize import minimize_scalar
 
 from robotid.base.tolerances import CONVERGED
 from robotid.base.typing import Array
@@ -168,6 +167,7 @@ def estimated_errors(
 
 def _largest(z2: Array, u2: Array) -> float:
     """Return s with the smallest sum of log(1 + s^2 z^2) + u^2 / (1 + s^2 z^2)."""
+    from scipy.optimize import minimize_scalar  # takes long to import
 
     def loss(x: float) -> float:
         grown = 1.0 + np.exp(2.0 * x) * z2
@@ -176,8 +176,7 @@ def _largest(z2: Array, u2: Array) -> float:
     grid = np.linspace(np.log(_LEAST), np.log(_MOST), _TRIED)  # more than one minimum is possible
     k = int(np.argmin([loss(x) for x in grid]))
     near = grid[max(k - 1, 0)], grid[min(k + 1, _TRIED - 1)]
-    options = {"xatol": 0.1 * CONVERGED}
-    return float(np.exp(minimize_scalar(loss, bounds=near, method="bounded", options=options).x))
+    return float(np.exp(minimize_scalar(loss, bounds=near, options={"xatol": 0.1 * CONVERGED}).x))
 
 
 def _slopes(model: RobotModel, rows: Rows, pi: Array, points: Sequence[int]) -> Array:

@@ -11,6 +11,7 @@ import pytest
 from helpers.paths import ROOT
 from helpers.piecework import marks, pieces_in, reduce_piece, workers_of
 
+from robotid.base.cores import available_cores
 from robotid.base.exceptions import (
     DataError,
     MissingDependencyError,
@@ -19,7 +20,6 @@ from robotid.base.exceptions import (
     SettingsError,
     WorkerError,
 )
-from robotid.dynamics.factors import available_cores
 from robotid.estimation.work_plan import WorkPlan, choose_workers
 
 # a busy disk is no error of a cluster

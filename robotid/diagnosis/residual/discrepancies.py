@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy.interpolate import BSpline
 
 from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
@@ -340,6 +339,8 @@ def _changing(
     rows = count * _BLOCKS * decisions.SHORTEST
     if n <= 3 or error < decisions.AGREES or count < decisions.SCATTERED:
         return
+    from scipy.interpolate import BSpline  # takes long to import
+
     folded, order = sample.in_blocks(rows, decisions.SHORTEST)
     knots = np.pad(np.linspace(0.0, rows, count - 1), 2, "edge")
     B = BSpline.design_matrix(order, knots, 2).toarray()  # (rows, count), quadratic

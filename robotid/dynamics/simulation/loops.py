@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
+from robotid.base.cores import in_order
 from robotid.base.exceptions import NotConvergedError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.data.log import Log
-from robotid.dynamics.factors import in_order
 from robotid.dynamics.rows import Tree, flatten, why_not
 from robotid.robot.drive_term import BRISTLES, DIRECTED, DriveTerm, MemorylessTerm
 from robotid.robot.drives import Bristles
