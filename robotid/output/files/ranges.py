@@ -282,9 +282,12 @@ def sample(result: Result, count: int, rng: np.random.Generator) -> tuple[list[s
     def is_possible(x: Array) -> Array:
         drawn = nominal + x
         signs = (drawn[:, is_bounded] >= 0.0).all(1) & (drawn[:, is_positive] > 0.0).all(1)
-        J = pseudo_inertia((drawn[:, : model.layout.n_inertial] - held).reshape(-1))
-        minors = [np.linalg.det(J[:, :k, :k]) > 0.0 for k in (1, 2, 3, 4)]  # Sylvester
-        return np.asarray(signs & np.all(minors, axis=0).reshape(len(x), -1).all(1))
+        bodies = (drawn[:, : model.layout.n_inertial] - held).ravel()
+        J = np.moveaxis(pseudo_inertia(bodies), 0, 2)  # (4, 4, bodies of all draws)
+        while len(J) > 1:  # the last pivot of an elimination is NaN if one before is not positive
+            pivot = np.where(J[0, 0] > 0.0, J[0, 0], np.nan)
+            J = J[1:, 1:] - J[1:, :1] * (J[:1, 1:] / pivot)
+        return np.asarray(signs & (J[0, 0] > 0.0).reshape(len(x), -1).all(1))
 
     x = possible_draws(root, is_possible, count, rng)
     drawn = nominal + x
@@ -307,8 +310,7 @@ def _between(content: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return quantiles of the next log, errors of the mean and of it, and number, by parameter."""
     between: dict[str, dict[str, Any]] = {}
     at_bound = {x["name"] for x in content["drive_parameters"] if x.get("at_bound")}
-    parameters = content.get("variation", {}).get("parameters", {})
-    for k, (name, entry) in enumerate(parameters.items()):
+    for k, (name, entry) in enumerate(content.get("variation", {}).get("parameters", {}).items()):
         if name not in at_bound:
             low, high = entry["next_interval"]
             errors = entry["std_error"], (high - low) / (2.0 * QUANTILE)
@@ -338,13 +340,9 @@ def _bodies(model: RobotModel, values: Array) -> dict[str, Any]:
     c = J[..., :3, 3] / m[..., None]
     about = J[..., :3, :3] - m[..., None, None] * c[..., :, None] * c[..., None, :]
     inertia = np.trace(about, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - about
-    rows, columns = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
+    moments = inertia[..., (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)]
     return {
-        body: {
-            "mass": m[:, i].tolist(),
-            "com": c[:, i].tolist(),
-            "inertia": inertia[:, i][:, rows, columns].tolist(),
-        }
+        body: {"mass": m[:, i].tolist(), "com": c[:, i].tolist(), "inertia": moments[:, i].tolist()}
         for i, body in enumerate(layout.bodies)
     }
 
