@@ -122,7 +122,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _show(content: dict[str, Any], *, is_verbose: bool) -> None:
     motions = recordings_of(content["motions"], "motion")
-    count = f"{content['structure']['base']} base parameters, by {content['estimator']}"
+    count = f"{content['structure']['base']} base parameters, estimator {content['estimator']}"
     echo(f"{content['robot']}: {', '.join(motions)}; {count}", "  ")
     entries, shown = content["base_parameters"], content["base_parameters"]
     if not is_verbose:
@@ -147,7 +147,7 @@ def _show(content: dict[str, Any], *, is_verbose: bool) -> None:
     parameters = [*content["standard_parameters"], *content["drive_parameters"]]
     sources = [entry["source"] for entry in parameters]
     counts = [f"{sources.count(source)} {source}" for source in dict.fromkeys(sources)]
-    echo(f"\nstandard parameters, given the URDF: by {listed(counts)}", "  ")
+    echo(f"\nstandard parameters by source, given the URDF: {listed(counts)}", "  ")
     if is_verbose:
         rows = [[e["name"], f"{e['prior']:.4g}", _two_digits(e["std_error"]), e["unit"],
                  e["source"]] for e in parameters]  # fmt: skip

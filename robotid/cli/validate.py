@@ -258,7 +258,7 @@ def _show(content: dict[str, Any]) -> None:
                 for joint, error in expected["per_joint"].items()
                 if error["within_95_pct"] is not None
             )
-            echo(f"expected rmse by the fit{source} (share of rows within 95 %): {figures}", "  ")
+            echo(f"expected rmse [N m or N] by the fit{source} (rows within 95 %): {figures}", "  ")
     for finding in content.get("findings", ()):
         echo(f"\n{finding['message']}")
     print_verdict(content["verdict"])

@@ -112,7 +112,7 @@ def test_validation_expects_the_error_of_the_next_log(result, folder, capsys):
     show_validation(done)
     printed = " ".join(capsys.readouterr().out.split())
     assert (
-        "expected rmse by the fit and spread between logs (share of rows within 95 %): "
+        "expected rmse [N m or N] by the fit and spread between logs (rows within 95 %): "
         "shoulder_lift_joint 1.23 (95 %)"
     ) in printed
 

@@ -80,8 +80,7 @@ class Section(NamedTuple):
 
 def text(value: str, *, flag: bool = False) -> Cell:
     """Return a cell of text."""
-    short = "text" if len(value) < 24 else ""
-    return Cell(escape(value), f"flag {short}".strip() if flag else short)
+    return Cell(escape(value), " ".join(["flag"] * flag + ["text"] * (len(value) < 24)))
 
 
 def code(value: str) -> Cell:
@@ -228,6 +227,7 @@ def page(title: str, header: str, sections: Mapping[str, tuple[Any, ...]]) -> st
     shown = {key: Section(*section) for key, section in sections.items()}
     links = "".join(f'<a href="#{key}">{x.title}</a> ' for key, x in shown.items())
     body = "".join(_section(key, section) for key, section in shown.items())
+    body = body.replace("m^2", "m²").replace("s^2", "s²")  # units in tables and charts
     named = [name for name, mark in _SCRIPTS.items() if re.search(mark, header + body)]
     has_dock = _DOCK in body
     style = asset("page.css") + (asset("dock.css") if has_dock else "")

@@ -584,7 +584,7 @@ def _parts(torque: JointTorque) -> str:
         share = 100 * rms[name] / rms["measured"] if rms["measured"] else None
         details = Cell(escape(", ".join(terms)) if len(terms) > 1 else "")
         rows.append([cell(name, "text"), cell(rms[name], ".3g"), percent(share), details])
-    headers = ["component", f"RMS {torque.unit}", "% of torque", "terms, RMS"]
+    headers = ["component", f"RMS [{torque.unit}]", "% of torque", "terms, RMS"]
     return table(f"{torque.joint}: torque components, which may cancel", headers, rows)
 
 

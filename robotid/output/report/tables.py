@@ -284,7 +284,7 @@ _BASE = (
 )  # fmt: skip
 _INPUTS = (
     ("role", "text", "role"), ("file", "code", "path"), ("samples", "d", "samples"),
-    ("rate Hz", ".5g", "rate"), ("from s", ".6g", "start"), ("to s", ".6g", "end"),
+    ("rate [Hz]", ".5g", "rate"), ("from [s]", ".6g", "start"), ("to [s]", ".6g", "end"),
     ("segments", "d", "segments"), ("SHA-256", "code", "sha256"),
 )  # fmt: skip
 

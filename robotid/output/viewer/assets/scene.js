@@ -307,6 +307,11 @@ const AZIMUTHS = [35, 60, -35, -60]; // [degrees] from the front; the first, unl
 // height of the camera over its distance along the ground: larger for a motion that is flat, as of a planar arm
 const RISE = 0.39 + 1.2 * Math.max(0, 1 - (3 * spans[2]) / Math.max(spans[0], spans[1]));
 
+function covered(id) { // share of the view's height that controls cover on narrow pages
+  const { width, height } = byId(id).getBoundingClientRect();
+  return width > pane.clientWidth / 2 ? height / pane.clientHeight : 0;
+}
+
 function framed(azimuth) { // the nearest camera of a direction with all points in sight
   const turn = (azimuth * Math.PI) / 180, up = new THREE.Vector3(0, 1, 0);
   const away = new THREE.Vector3(Math.cos(turn), RISE, Math.sin(turn)).normalize();
@@ -320,10 +325,12 @@ function framed(azimuth) { // the nearest camera of a direction with all points 
     return { far: (side(1) + side(-1)) / (2 * share), centre: (side(1) - side(-1)) / 2 };
   };
   const shape = pane.clientWidth / Math.max(pane.clientHeight, 1);
-  const wide = fit(x, FILLED * TALL * shape), tall = fit(y, FILLED * TALL);
+  const above = covered("tools"), below = covered("models");
+  const wide = fit(x, FILLED * TALL * shape), tall = fit(y, FILLED * TALL * (1 - above - below));
+  const far = Math.max(wide.far, tall.far, 1e-3);
   const target = new THREE.Vector3().addScaledVector(right, wide.centre)
-    .addScaledVector(up, tall.centre).addScaledVector(away, depth);
-  return { away, target, far: Math.max(wide.far, tall.far, 1e-3) };
+    .addScaledVector(up, tall.centre + (above - below) * TALL * far).addScaledVector(away, depth);
+  return { away, target, far };
 }
 
 function aim() { // from the front and above, the whole motion as large as it fits
