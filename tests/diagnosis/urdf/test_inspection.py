@@ -153,6 +153,12 @@ def test_a_fault_of_the_file_is_named(tmp_path, old, new, code, where, severity,
     json.dumps(inspection.to_dict(), allow_nan=False)
 
 
+def test_point_masses_are_no_lengths_in_another_unit(tmp_path):
+    text = CLEAN.replace("0.2 0 0", "0.4 0 0").replace("0.1 0 0", "0 0 0")
+    (tmp_path / "points.urdf").write_text(re.sub('(i..)="0.[0-9]+"', r'\1="1e-6"', text))
+    assert {x.code for x in inspect_urdf(tmp_path / "points.urdf").findings} == {"default_inertial"}
+
+
 def test_a_fit_is_warned_of_impossible_inertias_only(tmp_path):
     inspected(tmp_path, ('izz="0.11"', 'izz="0.23"'), ('izz="0.035"', 'izz="0.05"'))
     (finding,) = impossible_inertials(RobotModel.from_urdf(tmp_path / "two.urdf"))
