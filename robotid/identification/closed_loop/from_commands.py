@@ -463,7 +463,7 @@ def _at_bound(result: PositionIdentification, *, is_explained: bool) -> Iterator
             remedies.append(f"compare {' and '.join(gains)} with the gains of the drive")
         if "delay" in stated:
             remedies.append("leave the delay out of [controller], so that it is fitted")
-        remedies.append(f"command a motion that depends more on {listed(at_zero, NAMED)}")
+        remedies.append(f"command a motion that excites {listed(at_zero, NAMED)} more")
         todo = "; ".join(remedies)
         todo = f"{todo[0].upper()}{todo[1:]}"
         yield _named("at_bound:zero", at_zero, wrong=wrong, todo=todo)
