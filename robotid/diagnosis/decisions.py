@@ -40,7 +40,7 @@ SIMULATED_FAMILY = Rule(most=3, share=0.02, p_value=None, alike=0.0)
 LEAST_TERM = 0.006
 #: p-value below which a family that is not selected is undecided: it widens intervals.
 UNDECIDED_P_VALUE = 0.25
-TENFOLD = 10.0  # Factor on the standard error of another parameter above which terms are reported
+TENFOLD = 10.0  # Factor on a standard error above which a family is badly conditioned
 #: Distance from a bound, of the logarithm of its range, within which a shape is at the bound.
 AT_BOUND = 0.02
 #: Share of the squared residual that a missing term, a recording or URDF that differs, or a

@@ -36,8 +36,8 @@ def explained(
 
 def _stage(one: Finding) -> int:
     """Return the stage of a finding; 0 of one that neither explains nor is explained."""
-    stage = int(entries()[one.code].get("stage", 0))
-    return _RESIDUAL if 0 < stage < _UNNAMED and not one.log else stage
+    stage, is_of_fit = int(entries()[one.code].get("stage", 0)), one.severity != "error"
+    return _RESIDUAL if 0 < stage < _UNNAMED and not one.log and is_of_fit else stage
 
 
 def _explains(cause: Finding, one: Finding, bound: Mapping[str, Array]) -> bool:

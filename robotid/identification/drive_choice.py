@@ -325,7 +325,6 @@ def _found(
         shape_covariance=tuple(tuple(row) for row in covariance.tolist()),
         sizes=tuple(tuple(sizes) for _, sizes in refined),
         data_range=drive.data_range,
-        grown=_grown(weighted, drive, refined),
     )  # fmt: skip
 
 

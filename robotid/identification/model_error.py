@@ -75,18 +75,18 @@ def _of_shapes(fit: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> Iter
     # The errors of a joint's shapes are correlated: C_s = L L^T, one direction per column of L.
     for choice in fit.drives:
         if choice.shapes:
-            T = _trial(sample, choice, motions, partial(_slopes, fit, choice), REMAINDER).T[:, :-1]
+            slopes = partial(_slopes, fit, choice)
+            T = _trial(sample, choice, motions, slopes, REMAINDER).T[:, :-1]
             variance, axes = np.linalg.eigh(np.array(choice.shape_covariance))
             for axis in (axes * np.sqrt(np.maximum(variance, 0.0))).T:
-                torque = partial(_shape_change, fit, choice, axis)
-                yield _Move(choice.joint, -(T @ axis), torque)
+                yield _Move(choice.joint, -(T @ axis), partial(_combined, slopes, axis))
 
 
-def _shape_change(
-    fit: Fit, choice: DriveChoice, axis: Array, motion: DriveMotion, alone: JointMotion
+def _combined(
+    columns: Callable[[DriveMotion], Array], x: Array, motion: DriveMotion, alone: JointMotion
 ) -> Array:
-    """Return the change of a drive's torque for a change of its shapes by (k,), shape (N,)."""
-    return np.asarray(_slopes(fit, choice, motion) @ axis)
+    """Return the torque of the columns of a drive times parameters (c,), shape (N,)."""
+    return np.asarray(columns(motion) @ x)
 
 
 def _trial(
@@ -122,17 +122,10 @@ def settled_shapes(fit: Solution) -> tuple[DriveChoice, ...] | None:
 def _of_undecided(fit: Fit, sample: Sample, motions: Sequence[DriveMotion]) -> Iterator[_Move]:
     """Yield the uncertain parts of terms that were nearly selected."""
     for choice in (choice for choice in fit.drives if choice.undecided):
-        whole = _trial(sample, choice, motions, partial(_columns, choice.undecided))
+        columns = partial(_columns, choice.undecided)
+        whole = _trial(sample, choice, motions, columns)
         theta = whole.parameters(range(len(choice.undecided)))
-        torque = partial(_of_terms, choice.undecided, theta)
-        yield _Move(choice.joint, -whole.T[:, :-1] @ theta, torque)
-
-
-def _of_terms(
-    terms: Sequence[DriveTerm], theta: Array, motion: DriveMotion, alone: JointMotion
-) -> Array:
-    """Return the torque of terms of a drive, shape (N,)."""
-    return np.asarray(_columns(terms, motion) @ theta)
+        yield _Move(choice.joint, -whole.T[:, :-1] @ theta, partial(_combined, columns, theta))
 
 
 def _columns(terms: Sequence[DriveTerm], motion: DriveMotion) -> Array:

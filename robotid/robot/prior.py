@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from robotid.base.tolerances import SLACK
+from robotid.base.tolerances import SLACK, TINY
 from robotid.base.typing import Array
 from robotid.robot.bodies import (
     BEYOND_FRAMES,
@@ -37,7 +37,8 @@ _DENSITY = 1000.0  # [kg/m^3] without a body to take it from
 _COPIES = 3  # identical isotropic inertials are placeholders
 # medians over the bodies of all robots in example-robot-data: at most 2e4 kg/m^3 and 7
 _DENSEST = 5e4  # [kg/m^3] over the box of a body's frames; with masses in g 1e5 and more
-_FARTHEST = 30.0  # RMS distance of the mass from the joint over that box; in mm 160 and more
+THIN = 0.01  # [m] least size of a body: thin sheets have a volume
+FARTHEST = 30.0  # RMS distance of the mass from the joint over that box; in mm 160 and more
 
 
 def prior_spread(model: RobotModel, squares: Array, samples: int) -> Array:
@@ -156,13 +157,16 @@ def _reasons(model: RobotModel, J: Array, sides: dict[str, Array]) -> dict[str, 
     is_impossible, has_mass = least < -SLACK * scale, mass > 0
     codes |= dict.fromkeys(compress(bodies, is_impossible), "not_positive_definite")
     codes |= dict.fromkeys(compress(bodies, ~has_mass), "missing_inertial")
+    centre = np.linalg.norm(J[:, :3, 3], axis=1) / np.maximum(mass, TINY)
+    second = np.trace(J[:, :3, :3], axis1=1, axis2=2) / np.maximum(mass, TINY)
+    gyration = np.sqrt(np.maximum(second - centre**2, 0.0)) + THIN
+    codes |= dict.fromkeys(compress(bodies, centre > FARTHEST * gyration), "inertial_units")
     sized = [k for k, body in enumerate(bodies) if mass[k] > 0 and body in sides]
     if sized:
         size = np.array([sides[bodies[k]] for k in sized])
         density = np.median(mass[sized] / size.prod(axis=1))
-        second = np.abs(np.trace(J[sized, :3, :3], axis1=1, axis2=2)) / mass[sized]
-        distance = np.median(np.sqrt(second) / np.linalg.norm(size, axis=1))
-        if density > _DENSEST or distance > _FARTHEST:
+        distance = np.median(np.sqrt(np.abs(second[sized])) / np.linalg.norm(size, axis=1))
+        if density > _DENSEST or distance > FARTHEST:
             codes |= dict.fromkeys(compress(bodies, has_mass), "inertial_units")
     negligible = negligible_bodies(model)  # as between the axes of a ball joint
     return {body: code for body, code in codes.items() if code and body not in negligible}

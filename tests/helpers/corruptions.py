@@ -92,6 +92,11 @@ def late(prefix, delay):
     return column(prefix, lambda x, t: np.interp(t - delay, t, x))
 
 
+def delayed(log, delay, joint=""):
+    table = late(f"tau_{joint}", delay)(table_of(log))
+    return replace(log, tau=np.column_stack([table[f"tau_{joint}"] for joint in log.joints]))
+
+
 def without(name):
     return lambda table: {key: values for key, values in table.items() if key != name}
 
@@ -127,14 +132,15 @@ def differenced(bits, name):
     return change
 
 
-def compensated(table):
-    """Take the gravity torque off that the URDF says, as a controller's channel does."""
+def compensated(table, speed=0.0):
+    """Take off the torque that the URDF says of the motion at a speed: 0 is gravity alone."""
     import pinocchio as pin
 
-    model = robot("ur5")
-    q = np.column_stack([table[f"q_{joint}"] for joint in model.joints])
-    data = model.pin_model.createData()
-    loads = np.array([pin.computeGeneralizedGravity(model.pin_model, data, x) for x in q])
+    model, t = robot("ur5"), table["time"]
+    q, v = (np.column_stack([table[f"{x}_{joint}"] for joint in model.joints]) for x in ("q", "dq"))
+    engine, a = model.pin_model, np.gradient(v, t, axis=0)
+    at = zip(q, speed * v, speed**2 * a, strict=True)
+    loads = np.array([pin.rnea(engine, engine.createData(), *x) for x in at])
     torques = {f"tau_{joint}": loads[:, j] for j, joint in enumerate(model.joints)}
     return {name: x - torques.get(name, 0.0) for name, x in table.items()}
 
@@ -197,6 +203,9 @@ CASES = {
     "torques held for 5 rows": Case(("repeated_torque",), held("tau_", 5)),
     "one torque held for 3 rows": Case(("repeated_torque",), held("tau_elbow", 3)),
     "gravity-compensated torques": Case(("gravity_compensated",), compensated),
+    "torques without a model": Case(("gravity_compensated",), lambda x: compensated(x, 1.0)),
+    "clock slow by 20 %": Case(("time_scale",), both(
+        scaled("time", 0.8), lambda x: {k: y for k, y in x.items() if k[:2] != "dq"})),
     "static joint": Case(("static_joint",), both(
         column("q_wrist_3_joint", lambda x, _t: np.full_like(x, x[0])), scaled("dq_wrist_3", 0))),
     "stale rows": Case(("stale_rows",), stale),
@@ -213,6 +222,8 @@ CASES = {
     "missing torque column": Case(("missing_column",), without("tau_elbow_joint")),
     "position offset by 0.5 rad": Case(("position_offset",), column(f"q_{A}",
         lambda x, _t: x + 0.5)),
+    "position offset by 0.2 rad": Case(("position_offset",), column(f"q_{A}",
+        lambda x, _t: x + 0.2)),
     "five spikes of 1000 N m": Case(("spikes",), column("tau_elbow_joint",
         lambda x, t: set_rows(len(x) * np.arange(1, 10, 2) // 10, 1000.0)(x, t))),
     "too few rows": Case(("too_short",), rows(lambda x: x[:30])),

@@ -179,7 +179,6 @@ def test_of_families_alike_the_better_conditioned_is_chosen(plain, rising):
     stated = helper.found_in(plain, rising_logs(rising), friction={ELBOW: "stribeck", "*": "none"})
     (other,) = (c for c in stated.drives if c.families)
     assert other.shapes[0].is_at_bound
-    assert other.grown[f"{ELBOW}.coulomb"] > 10.0 > choice.grown[f"{ELBOW}.coulomb"]
     (said,) = [f for f in stated.findings if f.code == "correlated_terms"]
     assert (said.severity, said.where) == ("note", ELBOW)
     assert re.match(

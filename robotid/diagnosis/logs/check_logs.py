@@ -46,22 +46,23 @@ def diagnose(
     # friction with an internal state is not examined here
     model = with_assumed_inertials(model.with_terms({}))
     examined = [_examine_log(model, log, signals) for log in (*fitted, *validation)]
-    _examine_torques(model, [one for one in examined if one.is_tried], signals)
-    findings = [*assumed_inertials(model), *(x for one in examined for x in one.findings)]
+    assumed = assumed_inertials(model)
+    is_possible = all(x.severity != "error" for x in assumed)
+    _examine_torques(model, [one for one in examined if one.is_tried and is_possible], signals)
+    findings = [*assumed, *(x for one in examined for x in one.findings)]
     first = [one.motion for one in examined[: len(fitted)] if one.motion is not None]
     probes = [x.probe for x in examined[: len(fitted)] if x.probe and not model.constraints]
     mapping = structural_mapping(model) if probes else None
     for k, log in enumerate(fitted):
         same = [x.name for x in fitted[:k] if np.array_equal([x.q, x.tau], [log.q, log.tau])]
         findings += [finding("repeated_log", log.name, other=same[0])] if same else []
-    moving = [probe.motion for probe in probes]
     for one in examined[len(fitted) :]:
         share = 0.0 if one.motion is None else repeated_share(first, one.motion)
         if share >= REPEATED:
             findings.append(finding("repeated_motion", one.log.name, share=share))
     if mapping is not None:
         names = ", ".join(log.name for log in fitted)
-        findings += check_excitation(model, mapping, moving, signals, names)
+        findings += check_excitation(model, mapping, [x.motion for x in probes], signals, names)
         findings += [x for x in rounded_angles(model, mapping) if x.evidence["felt"]]
     return by_severity(x for x in explained(findings, model) if not explained_by_assumed(model, x))
 

@@ -24,7 +24,6 @@ from robotid.diagnosis.decisions import (
     connected,
 )
 from robotid.diagnosis.logs.channels import runs_of
-from robotid.estimation.fitting.standard_errors import QUANTILE
 
 SECONDS = 5.0  # [s] of the averaged spectra, and least total time of constant commands
 EXCITED = 1e-4  # least power of a command, over that of its strongest frequency
@@ -61,7 +60,7 @@ def check_commands(log: Log, prismatic: Collection[str] = ()) -> Iterator[Findin
     known = {name for one in held for name in one.joints}
     small = list(_small(log, [loop for loop in moved if loop.name not in known]))
     yield from (*held, *small)
-    yield from _slow(log, moved) if not early and not small else ()
+    yield from _slow(log, moved) if not (confused or held or small) else ()
     yield from _sampled(log, moved)
     yield from _disturbed(log, loops)
 
@@ -153,27 +152,6 @@ class _Loop:
         delay = float(share @ (-phase / w))
         spread = np.sqrt(float(share @ (-phase / w - delay) ** 2) / max(len(w) - 1, 1))
         return first + delay, max(float(spread), float(1 / np.sqrt(np.sum(weight * w**2))))
-
-    @cached_property
-    def delays(self) -> tuple[float, float]:
-        """The shortest and the longest pure delay that are consistent with the response [s]."""
-        # H = exp(-i w T) / (g + d i w - j w^2), linear in g, d, j for each T; T <= lag: d >= 0.
-        f, H, weight = self.response
-        lag, error = self.lag
-        longest = max(lag + 2 * error, 0.0) if np.isfinite(lag) else _LONGEST
-        delays = np.arange(0.0, min(longest, _LONGEST), self.step / _RESOLVED)
-        if len(f) < 4 or not len(delays):
-            return 0.0, longest
-        w, root = 2 * np.pi * f, np.sqrt(weight)
-        A = np.column_stack([H, 1j * w * H, -(w**2) * H]) * root[:, None]  # (m, 3)
-        Q = np.linalg.qr(np.concatenate([A.real, A.imag]))[0]
-        b = np.exp(-1j * w * delays[:, None]) * root  # (delays, m)
-        b = np.concatenate([b.real, b.imag], axis=1)
-        squares = np.sum(b**2, axis=1) - np.sum((b @ Q) ** 2, axis=1)
-        least = squares.min()
-        noise = max(float(least) / (2 * len(f) - 4), 1.0)
-        fits = delays[squares < least + QUANTILE**2 * noise]
-        return float(fits[0]), float(fits[-1])
 
     @cached_property
     def sweeps(self) -> tuple[Array, Array]:
@@ -311,17 +289,11 @@ def _interrupted(log: Log, loop: _Loop) -> Iterator[Finding]:
 
 def _slow(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     """Yield the joints whose command is too slow to distinguish a delay from damping."""
-    slow = {}
-    for loop in loops:
-        (least, most), lag, step = loop.delays, loop.lag[0], loop.step
-        is_narrow = most - least <= max(step, BETTER * lag)
-        is_determined = is_narrow and (most < lag - step / _RESOLVED or lag < step)
-        if np.isnan(loop.bandwidth) and np.isfinite(lag) and not is_determined:
-            slow[loop.name] = (float(loop.response[0].max()), least, most)
-    if slow:
-        fastest, shortest, longest = zip(*slow.values(), strict=True)
-        figures = {"shortest": min(shortest), "longest": max(longest)}
-        yield _of_joints("slow_command", log, slow, frequency=max(fastest), **figures)
+    slow = [loop for loop in loops if np.isnan(loop.bandwidth) and loop.lag[0] > loop.step]
+    if 2 * len(slow) >= len(loops) > 0:  # else the other joints show the delay
+        figures = {"frequency": max(float(loop.response[0].max()) for loop in slow)}
+        figures["longest"] = max(loop.lag[0] + 2 * loop.lag[1] for loop in slow)
+        yield _of_joints("slow_command", log, [loop.name for loop in slow], **figures)
 
 
 def _small(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
@@ -330,10 +302,12 @@ def _small(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     for loop in loops:
         (swept, followed), step = loop.sweeps, quantum(loop.q)
         code, sweep = "small_command", float(np.ptp(loop.command))
-        share = float(np.median(followed / swept)) if len(swept) >= SCATTERED else 1.0
+        share, dead = 1.0, 0.0
+        if len(swept) >= SCATTERED:
+            share, dead = float(np.median(followed / swept)), float(np.median(swept - followed))
         evidence = {"sweep": sweep, "followed": share, "step": step}
-        if share < BETTER:
-            what, dead = "suppressed", float(np.median(swept - followed))
+        if share < BETTER and sweep < 5 * dead:
+            what = "suppressed"
             evidence |= {"sweep": float(np.median(swept)), "dead": dead, "wanted": 5 * dead}
             if loop.response_to(loop)[1] < AGREES:  # it is linear, without a dead band
                 what = "weak"

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.diagnosis.decisions import EXACT, ZERO
+from robotid.diagnosis.decisions import EXACT, TENFOLD, ZERO
 from robotid.diagnosis.logs.probe import Probe, drive_columns
 from robotid.dynamics.constraint_rows import constraint_jacobian, force_basis, without_forces
 from robotid.dynamics.rows import inertial_rows, joint_constants
@@ -37,7 +37,8 @@ _SEGMENTS = 8  # of the log that are held out in turn
 _BODIES = 20  # of a limb, at most
 _TRIED = 10  # readings that are tried with all instants
 _TILT = 0.35  # tangent of the angle of a base that is not level
-_OFFSET = 0.4  # [rad] of a zero position
+OFFSET = 0.4  # [rad] of a zero position
+QUARTERS = (0.0, np.pi / 2, -np.pi / 2, np.pi)  # around which zero positions are searched
 _DRIVE = 4  # columns of a drive: offset, armature, viscous and Coulomb friction
 
 
@@ -78,7 +79,6 @@ class _Motion:
     gravity: Array  # (n,), factor of the torque of gravity on each joint
     inertia: Array  # (n,), factor of the torque of inertia on each joint
     clock: float = 1.0  # speed of the time stamps
-    subtracted: float = 0.0  # factor of the URDF's gravity that was subtracted from the torques
     segments: int = _SEGMENTS  # of the instants
 
     @cached_property
@@ -86,12 +86,11 @@ class _Motion:
         """P^T P of each segment and joint: P = [bodies, drive, URDF's torque, columns of tau]."""
         # Rows without unknown forces of contacts contain the drives of all joints.
         X, pi = self.inertial(), self.model.standard_parameters()[self.moved]
-        urdf, reach, rows, (N, n) = X @ pi, self.reach, self.rows, self.tau.shape
-        if (self.gravity != 1.0).any() or (self.inertia != 1.0).any() or self.subtracted:
+        reach, rows, (N, n) = self.reach, self.rows, self.tau.shape
+        if (self.gravity != 1.0).any() or (self.inertia != 1.0).any():
             weight = replace(self, clock=0.0).inertial()
             gravity, inertia = (x[reach, None] for x in (self.gravity, self.inertia))
             X = inertia * (X - weight) + gravity * weight
-            urdf = X @ pi - self.subtracted * (weight @ pi)
         k = len(self.model.joints)
         every = drive_columns(self.model, self.q, self.v[:, -k:], self.a[:, -k:])
         level = np.sqrt(np.mean(self.tau**2, axis=0).max())
@@ -104,7 +103,7 @@ class _Motion:
         if self.basis is not None:
             drive = np.einsum("kjd,ji->kidj", drive, np.eye(n)[rows]).reshape(N, n, -1)
             logged = self.tau[:, None] * np.eye(n)
-        P = np.concatenate([bodies, coupled, drive, urdf[..., None], logged], axis=2)
+        P = np.concatenate([bodies, coupled, drive, (X @ pi)[..., None], logged], axis=2)
         P = (P if self.basis is None else without_forces(self.basis, P)[:, rows]).swapaxes(0, 1)
         edges = [i * N // self.segments for i in range(self.segments + 1)]
         parts = [P[:, i:k] for i, k in pairwise(edges)]
@@ -308,6 +307,7 @@ class Reading:
         curvature, weight = 0.5 * (high + low) - before, 1.0 / (before + EXACT)
         least = weight @ curvature
         x = float(-0.5 * (weight @ slope) / least if least > 0.0 else -np.sign(weight @ slope))
+        x = float(np.clip(x, -TENFOLD, TENFOLD))  # a parabola holds near its three points
         lowest = np.maximum(before + slope * x + curvature * x**2, 0.0)
         if misfit(before) - misfit(lowest) > _ALIKE:
             yield replace(self, values=(self.step * x,))
@@ -344,7 +344,6 @@ def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
         if not np.allclose(start, -up):
             yield Reading("gravity", every, _falling, tuple(start.tolist()), 0.1)
     if g.any():
-        yield Reading("gravity_compensated", every, lambda s: s.changed(subtracted=1.0))
         yield Reading("gravity_compensated", every, partial(_weightless, on=np.ones(n)))
         yield Reading("static_torque", every, lambda s: s.changed(inertia=np.zeros(n)))
         for j in rows:
@@ -385,11 +384,12 @@ def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
             scaled = Reading("angle_scale", (j,), partial(_multiplied, j=j), (), 0.1)
             yield from scaled.started(samples)
         else:
-            for offset in (np.pi / 2, -np.pi / 2, np.pi, _OFFSET, -_OFFSET):
+            for offset in (*QUARTERS[1:], OFFSET, -OFFSET):
                 yield replace(shifted, values=(offset,))
     for j in turning if is_gross else ():
         for turn in _quarters(model, j):
-            yield Reading("axis_direction", (j,), partial(_turned, j=j, turn=turn))
+            turned = model.with_turned_axis(model.row_names[j], *turn)
+            yield Reading("axis_direction", (j,), lambda s, x=turned: s.changed(model=x))
 
 
 def _negated(samples: Samples, on: Array) -> Samples:
@@ -444,11 +444,6 @@ def _moved(samples: Samples, change: Callable[[Array], Array]) -> Samples:
     extra = m.q.shape[1] - m.v.shape[1]  # of the pose of a floating base
     q = np.hstack([m.q[:, :extra], change(m.q[:, extra:])])
     return samples.changed(q=q, v=change(m.v), a=change(m.a))
-
-
-def _turned(samples: Samples, j: int, turn: tuple[Array, bool]) -> Samples:
-    model = samples.motion.model
-    return samples.changed(model=model.with_turned_axis(model.row_names[j], *turn))
 
 
 def _quarters(model: RobotModel, j: int) -> Iterator[tuple[Array, bool]]:

@@ -9,10 +9,12 @@ from robotid.base.findings import Finding, listed
 from robotid.base.tolerances import TINY
 from robotid.base.typing import Array
 from robotid.data.units import STATIC
+from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import AGREES, BEYOND_NOISE, NO_ERROR_OF_MASSES, SIGNIFICANT, ZERO
+from robotid.diagnosis.decisions import BEYOND_NOISE, NO_ERROR_OF_MASSES, SIGNIFICANT, ZERO
+from robotid.diagnosis.logs import readings
 from robotid.diagnosis.logs.probe import Probe, drive_columns
-from robotid.diagnosis.logs.readings import CERTAIN, EXPLAINED, Best, Samples, best_readings, limbs
+from robotid.diagnosis.logs.readings import EXPLAINED, Best, Samples
 from robotid.robot.model import RobotModel
 
 _UNEXPLAINED = 0.25  # unexplained share of a torque's variance that is reported, not accepted
@@ -21,6 +23,8 @@ _INDEPENDENT, _PER_SECOND = 20.0, 3.0  # independent instants of a log, per seco
 _WORSE = 0.25  # allowed increase of a torque's misfit over its own fit, in variances
 _OTHER_UNIT = 30.0  # a common scale of all torques farther from 1 is another unit, no gain
 _SCALES = np.logspace(-3, 3, 61)
+_THINNED = 10  # instants of a log per one with which other readings are sought
+_NEAR = {"xatol": 0.01}  # [rad], or of the logarithm of a speed: where the search for them ends
 _WRONG_TILT = 30.0  # [deg] angle of gravity from the stated one that is an error
 _LARGE = 0.08  # payload over the arm's mass that errors of the links do not explain
 _MISMATCH = 7.5  # largest sum of squared errors of the links, in standard deviations
@@ -41,7 +45,7 @@ class TorqueCheck:
         # the friction of a joint at rest has any value: nothing contradicts its torque
         moves = np.ptp(probe.motion.q[:, -probe.tau.shape[1] :], axis=0) >= STATIC
         used = moves | bool(probe.model.constraints)  # forces of contacts connect all joints
-        groups = [(rows[used[rows]], is_tried) for rows, is_tried in limbs(probe.model)]
+        groups = [(rows[used[rows]], is_tried) for rows, is_tried in readings.limbs(probe.model)]
         samples = tuple((Samples.of(probe, rows, moves), x) for rows, x in groups if len(rows))
         share = np.ones(len(moves))
         for one, _ in samples:
@@ -52,7 +56,7 @@ class TorqueCheck:
         """Yield the other readings that explain the torques."""
         for samples, is_tried in self.limbs:
             if is_tried:
-                yield from _findings(samples, list(best_readings(samples)), name)
+                yield from _findings(samples, list(readings.best_readings(samples)), name)
 
     def loads(self, name: str) -> Iterator[Finding]:
         """Yield another scale, a load or another robot, and torques that nothing explains."""
@@ -74,7 +78,7 @@ class TorqueCheck:
 def is_suspect(check: TorqueCheck, others: Sequence[TorqueCheck]) -> bool:
     """Return whether a log explains a torque clearly worse than another log of the robot."""
     least = np.min([one.share for one in others], axis=0)
-    return bool((check.share > np.maximum(EXPLAINED, np.exp(CERTAIN) * least)).any())
+    return bool((check.share > np.maximum(EXPLAINED, np.exp(readings.CERTAIN) * least)).any())
 
 
 def _findings(samples: Samples, found: Sequence[Best], log: str) -> Iterator[Finding]:
@@ -83,8 +87,8 @@ def _findings(samples: Samples, found: Sequence[Best], log: str) -> Iterator[Fin
     final = found[-1].after if found else np.zeros(len(rows))
     exchanged: dict[str, list[Best]] = {}
     for one in found:
-        reading = one.reading
-        concerned = np.isin(rows, reading.joints) | (not reading.joints)
+        reading, named = one.reading, one.reading.joints or rows
+        concerned = np.isin(rows, named)
         # a joint without any torque of the bodies does not confirm that reading
         concerned &= one.samples.urdf_size > ZERO * samples.urdf_size
         is_unit = reading.code == "current_for_torque" and not reading.joints
@@ -93,9 +97,8 @@ def _findings(samples: Samples, found: Sequence[Best], log: str) -> Iterator[Fin
         if reading.code in _ORDERS:
             exchanged.setdefault(reading.code, []).append(one)
         elif reading.code in ("torque_sign", "unsigned_torque"):
-            each = [j for j in reading.joints or rows if one.before[rows.index(j)] > 0.0]
-            for j in each:
-                before, after = (x[rows.index(j)] for x in (one.before, one.after))
+            of_joint = zip(rows, one.before, one.after, strict=True)
+            for j, before, after in (x for x in of_joint if x[1] > 0.0 and x[0] in named):
                 yield finding(
                     reading.code, log, joints[j], kind="one", cure="one", unexplained=before,
                     unexplained_if_negated=after, unexplained_with_signs=after,
@@ -198,11 +201,9 @@ class LoadModel:
 def load_model(probe: Probe, share: Array) -> LoadModel:
     """Return the load model of a motion: share (n,)."""
     (N, n), drives = probe.tau.shape, drive_columns(probe.model, probe.q, probe.v, probe.a)
-    duration = float(np.ptp(probe.motion.t[probe.rows]))
-    independent = min(_INDEPENDENT, _PER_SECOND * duration)
-    links = probe.loads
-    bodies = links.shape[2]
-    X = np.concatenate([links, probe.last_body, probe.tau[:, :, None]], axis=2)
+    independent = min(_INDEPENDENT, _PER_SECOND * float(np.ptp(probe.motion.t[probe.rows])))
+    bodies = probe.loads.shape[2]
+    X = np.concatenate([probe.loads, probe.last_body, probe.tau[:, :, None]], axis=2)
     level = probe.tau.std(axis=0)
     used = (level > TINY * np.abs(probe.tau).max()) & (share < _UNEXPLAINED)
     R = np.zeros((n, bodies + 5, bodies + 5))
@@ -212,12 +213,12 @@ def load_model(probe: Probe, share: Array) -> LoadModel:
         U, s, _ = np.linalg.svd(drive / np.where(length > 0, length, 1.0), full_matrices=False)
         Q = U[:, s > TINY * s[0]]
         left = X[:, j] - Q @ (Q.T @ X[:, j])
-        sigma = np.sqrt(AGREES**2 + share[j]) * level[j]
+        sigma = np.sqrt(decisions.AGREES**2 + share[j]) * level[j]
         R[j] = np.linalg.qr(left * np.sqrt(independent / N) / sigma, mode="r")
     mean = np.append(np.ones(bodies), np.zeros(4))
     arm = _mass(probe.model)  # a payload is of its size
     spread = np.append(np.full(bodies, _SPREAD), [arm, *[arm * probe.model.length] * 3])
-    expected = independent * float((share / (AGREES**2 + share))[used].sum())
+    expected = independent * float((share / (decisions.AGREES**2 + share))[used].sum())
     return LoadModel(R, mean, spread, expected, independent * float(used.sum()))
 
 
@@ -227,34 +228,77 @@ def _check_loads(probe: Probe, share: Array, name: str, is_explained: bool) -> I
     model = load_model(probe, share)
     _, theta, error = model.fit()
     is_this_robot = model.is_this_robot()
-    if not is_this_robot and _is_compensated(probe):
-        yield finding("gravity_compensated", name, what="robot")
+    if not is_this_robot and (what := _subtracted(probe, model)):
+        yield finding("gravity_compensated", name, what=what)
     elif is_explained:
         scale, is_better = (1.0, False) if is_this_robot else _torque_scale(model)
         if scale != 1.0 and model.is_this_robot(scale):
-            used = [probe.model.joints[j] for j in np.flatnonzero(model.R.any(axis=(1, 2)))]
-            is_all = len(used) == len(share)
-            is_unit = is_all and abs(np.log(scale)) > np.log(_OTHER_UNIT)
+            used = np.array(probe.model.joints)[model.R.any(axis=(1, 2))].tolist()
+            is_unit = len(used) == len(share) and abs(np.log(scale)) > np.log(_OTHER_UNIT)
+            named = used if len(used) < len(share) else ()
             yield finding(
-                "current_for_torque", name, () if is_all else used, joints=len(used), also=False,
+                "current_for_torque", name, named, joints=len(used), also=False,
                 severity="error" if is_unit else "warning", factor=scale, joint=listed(used),
             )  # fmt: skip
         elif is_better or _error_of_links(theta) > _MISMATCH:
             factors = dict(zip(probe.model.layout.bodies, theta[:-4].tolist(), strict=True))
             words = ", ".join(f"{link} {factor:.2g}" for link, factor in factors.items())
-            yield finding("urdf_mismatch", name, factors=words, **factors)
+            mismatch = finding("urdf_mismatch", name, factors=words, **factors)
+            yield from _reread(probe, share, name) or [mismatch]
         else:
             yield from _payload(probe, theta[-4:], float(error[-4]), name)
 
 
-def _is_compensated(probe: Probe) -> bool:
-    """Return whether torques fit the URDF's masses only with the URDF's gravity added."""
+def _subtracted(probe: Probe, model: LoadModel) -> str:
+    """Return what of the URDF's torque is missing, with which the torques fit the URDF's masses."""
     still = np.zeros_like(probe.v)
     weight = replace(probe, v=still, a=still).loads.sum(axis=2)
-    if not weight.any():
-        return False
     whole = TorqueCheck.of(replace(probe, tau=probe.tau + weight))
-    return load_model(whole.probe, whole.share).is_this_robot()
+    chi, theta, _ = load_model(whole.probe, whole.share).fit()
+    if chi < decisions.BETTER * model.misfit(1.0) and _error_of_links(theta) < _MISMATCH:
+        return "robot"
+    R, rows = model.R.copy(), np.arange(len(model.R))
+    R[..., -1] += R[..., :-5].sum(axis=-1)  # the torque of all links
+    added = replace(model, R=R)
+    # a small torque fits in another scale, too: of bodies beside which friction is not most of it
+    bare = Samples.of(probe, rows, rows >= 0).changed(gravity=0.0 * rows, inertia=0.0 * rows)
+    is_clear = model.misfit(_torque_scale(model)[0]) - added.misfit(1.0) > SIGNIFICANT**2
+    is_clear |= bool((bare.share < 1.0 - decisions.MOST).all())
+    return "model" if is_clear and added.is_this_robot() else ""
+
+
+def _reread(probe: Probe, share: Array, log: str) -> list[Finding]:
+    """Return another clock or zeros with which the URDF's masses fit the torques, if there are."""
+    from scipy.optimize import minimize_scalar
+
+    joints, most = np.array(probe.model.joints), float(np.log(decisions.TENFOLD))
+
+    def read(x: float, joint: str, every: int = 1) -> Probe:
+        m, speed = probe.motion, 1.0 if joint else float(np.exp(x))
+        m = replace(m, q=m.q - x * (joints == joint), v=speed * m.v, a=speed**2 * m.a)
+        return Probe.of(probe.model, m, probe.rows[::every])
+
+    def misfit(x: float, joint: str) -> float:
+        return load_model(read(x, joint, _THINNED), share).misfit(1.0)
+
+    turning = [x for x in joints.tolist() if x not in probe.model.layout.prismatic]
+    starts = [(joint, x, readings.OFFSET) for joint in turning for x in readings.QUARTERS]
+    tried = [
+        (minimize_scalar(misfit, None, (x - far, x + far), joint, options=_NEAR), joint)
+        for joint, x, far in [("", 0.0, most), *starts]
+    ]
+    best, joint = min(tried, key=lambda x: x[0].fun)
+    if misfit(0.0, "") - best.fun < SIGNIFICANT**2:
+        return []
+    after, code = read(best.x, joint), "position_offset" if joint else "time_scale"
+    if not joint and best.x < -np.log(NO_ERROR_OF_MASSES):  # nine times less inertia, or none
+        code = "static_torque"
+    values: dict[str, float | str] = {"what": "log", "cure": "masses", "also": False}
+    values |= {"offset": best.x} if joint else {"speed": np.exp(-best.x)}
+    one = finding(code, log, (joint,) * bool(joint), severity="warning", **values)
+    is_robot = load_model(after, share).is_this_robot()
+    rest = [] if is_robot else _reread(after, share, log)
+    return [one, *rest] if is_robot or rest else []
 
 
 def _error_of_links(theta: Array) -> float:

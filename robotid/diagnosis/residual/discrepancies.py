@@ -136,9 +136,7 @@ def _of_robot(
         Reading("moving_gravity", 0.025, level, weighed, changes=True),
         Reading("external_force", least, every, push),
         Reading("external_force", least, every, push, changes=True),
-        Reading(
-            "joint_origin", 0.01, one + every, lambda on: by.by_origin[:, :, on > 0].reshape(shape)
-        ),
+        Reading("joint_origin", 0.01, one, lambda on: by.by_origin[:, :, on > 0].reshape(shape)),
         Reading(
             "axis_direction:residual", 0.03, one,
             lambda on: by.by_axis[:, :, on > 0].reshape(shape),
@@ -216,7 +214,6 @@ class _Alteration:
             "angle_scale": factor | residual | {"named": position},
             "torque_scale": factor | {"what": sense, "cure": sense},
             "time_scale": factor | residual | {"speed": np.sqrt(max(1 + x[0], 0.0))},
-            "joint_origin": {"named": joint or "a joint"},
             "external_force": {"what": "constant", "cure": "constant"},
         }
         more: dict[str, float | str] = {"named": ", ".join(self.joints) or "all joints"}

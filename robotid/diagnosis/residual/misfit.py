@@ -221,10 +221,6 @@ def _windup(m: JointMotion) -> Array:
     return np.column_stack([deflection, _sense(m, attrgetter("load"))])
 
 
-def _drift(m: JointMotion) -> Array:
-    return np.asarray(m.time[:, None] * np.column_stack([m.direction, m.v, np.ones_like(m.v)]))
-
-
 def _coupled(m: JointMotion, other: str, ratio: float) -> Array:
     """Return columns of a drive at the speed w = v + ratio v' of both joints, at the first."""
 
@@ -250,7 +246,8 @@ CANDIDATES = (
         "Increase min_velocity to exclude the reversals",
     ),
     Candidate(
-        "drift", "drift", _drift,
+        "drift", "drift",
+        lambda m: m.time[:, None] * np.column_stack([m.direction, m.v, np.ones_like(m.v)]),
         "friction or an offset that drifts with time (warm-up of the drive)",
         "Warm the robot up before recording, or cut the log with start",
     ),
@@ -321,9 +318,10 @@ def _explains(term: Finding, hypothesis: Finding) -> bool:
         return False
     if hypothesis.code == "unexplained_torque":
         return not term.joints or hypothesis.joints == term.joints
-    if hypothesis.code == "gravity":
-        return term.code in _OF_FORCE
-    return hypothesis.code in _OF_MASSES and term.code in (*_OF_POSITION, *_OF_FORCE)
+    if hypothesis.code in _OF_MASSES and "gain" not in hypothesis.evidence:  # no certain reading
+        return term.code in (*_OF_POSITION, *_OF_FORCE)
+    is_uncertain = hypothesis.code == "gravity" and hypothesis.severity != "error"
+    return is_uncertain and term.code in _OF_FORCE
 
 
 def _advice(term: Candidate, setting: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -116,12 +117,15 @@ def _of_static(fit: Fit) -> Finding:
 
 
 def _drive_findings(fit: Fit) -> Iterator[Finding]:
-    """Yield notes on friction shapes at their bounds, and on motion outside the fitted range."""
+    """Yield delays that were selected as terms, and notes on motion outside the fitted range."""
     for choice in fit.drives:
-        for shape in choice.shapes:
-            if shape.is_at_bound:
-                words = {"name": shape.name, "unit": shape.unit}
-                yield finding("shape_at_bound", "", choice.joint, value=shape.value, **words)
+        selected = [one for one in choice.tried if one.is_selected]
+        for before, after in pairwise(selected):  # a late torque has the term -T d(tau)/dt
+            explained = before.held_out_error_pct**2 - after.held_out_error_pct**2
+            if after.families[-1] == "lag" and explained > (100 * decisions.DIFFERS) ** 2:
+                k = fit.model.layout.names.index(f"{choice.joint}.lag")
+                sizes = {"size": fit.standard[k], "std_error": fit.standard_error[k]}
+                yield finding("joint_delay", "", choice.joint, explained=False, **sizes)
         guards = {term.guards for term in choice.terms if np.isfinite(term.data_range).all()} - {""}
         j = fit.model.joints.index(choice.joint)
         for evaluation in fit.validation:
@@ -133,8 +137,7 @@ def _drive_findings(fit: Fit) -> Iterator[Finding]:
                 if share > decisions.SHARE_OF_ROWS:
                     yield finding(
                         "beyond_range", "", choice.joint, share_pct=100 * share, low=low, high=high,
-                        what={"q": "positions", "v": "speeds"}[key],
-                        name=evaluation.recording.name, families=listed(choice.families),
+                        what=key, name=evaluation.recording.name, families=listed(choice.families),
                     )  # fmt: skip
 
 
@@ -156,14 +159,7 @@ def correlated_findings(fit: Fit) -> Iterator[Finding]:
             for m in (len(curve.v) // 2, -1)  # the slowest and the fastest
         )
         pair = " and ".join(single)
-        yield finding("correlated_terms", "", joint, what="pair", pair=pair, sums=sums, r=r)
-    for choice in fit.drives:
-        name = max(choice.grown, key=lambda name: choice.grown[name], default="")
-        if choice.joint not in joints and choice.grown.get(name, 1.0) > decisions.TENFOLD:
-            yield finding(
-                "correlated_terms", "", choice.joint, what="grown", name=name,
-                families=listed(choice.families), grown=choice.grown[name],
-            )  # fmt: skip
+        yield finding("correlated_terms", "", joint, pair=pair, sums=sums, r=r)
 
 
 def _correlations(C: Array, own: Sequence[int]) -> Array:
@@ -334,8 +330,6 @@ def _dense_bodies(fit: Fit) -> Iterator[Finding]:
         density = least_density(now)
         if density <= max(DENSEST, least_density(was)):
             continue
-        # at equal inertia the density is proportional to the mass to the power of 2.5
-        excess = float(now[0]) * (1.0 - (DENSEST / density) ** 0.4)
         rows = slice(10 * k, 10 * k + 10)
         covariance = fit.standard_covariance[rows, rows]
         share = density_share(now, covariance, DENSEST, np.random.default_rng(0))
@@ -344,18 +338,17 @@ def _dense_bodies(fit: Fit) -> Iterator[Finding]:
         yield finding(
             "dense_body", subject=f"link {body}", severity="note" if is_open else "warning",
             link=body, error=is_open, needs="finite" if is_finite else "none",
-            conclusion=is_open, cure=_cure(fit, body, excess), mass=now[0], density=density,
+            conclusion=is_open, cure=_cure(fit, body), mass=now[0], density=density,
             rounded=float(f"{density:.2g}") if is_finite else 0.0, densest=DENSEST,
             share=share, half_width=QUANTILE * np.sqrt(covariance[0, 0]),
         )  # fmt: skip
 
 
-def _cure(fit: Fit, body: str, excess: float = 0.0) -> str:
+def _cure(fit: Fit, body: str) -> str:
     """Return what to correct for an impossible body."""
     cure = "Record motion about more axes, or pin it to the URDF"
     for stated, mass in _stated_of(fit, body).items():
-        limit = f" (possible: up to about {mass - excess:.3g} kg)" * (excess > 0)
-        cure = f"Check the given {stated} of {mass:.4g} kg{limit}: weigh it, or remove it"
+        cure = f"Check the given {stated} of {mass:.4g} kg: weigh it, or remove it"
     return cure
 
 
@@ -381,6 +374,7 @@ def _of_outliers(fit: Fit) -> Finding:
     ) + f"; and {more} more" * (more > 0)
     return finding(
         "outliers", "", outliers[0].joint, where=places, cure=fit.estimator.is_robust,
+        severity="note" if fit.estimator.is_robust else "warning",
         count=f"{len(outliers)} outlier{'s' * (len(outliers) > 1)}", places=len(outliers),
         largest=outliers[0].size,
     )  # fmt: skip

@@ -55,9 +55,6 @@ class DriveChoice:
     shape_covariance: tuple[tuple[float, ...], ...] = ()  # their covariance, row by row
     sizes: tuple[tuple[float, ...], ...] = ()  # values of the shape parameters of each family
     data_range: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # "q", |"v"|
-    #: Factor by which the terms increase the standard errors of the drive's armature, viscous and
-    #: Coulomb friction and offset, by name.
-    grown: Mapping[str, float] = field(default_factory=dict)
     undecided: tuple[DriveTerm, ...] = ()  # not significant; errors include their change
 
     def to_dict(self) -> dict[str, Any]:

@@ -358,16 +358,16 @@ def loop_findings(
     result: PositionIdentification, examined: Sequence[Finding]
 ) -> tuple[Finding, ...]:
     """Return the findings of logs and fit, the most severe first."""
-    settled = [_settled_delay(one, result) for one in examined]
-    gains: list[Finding] = []
-    with suppress(NotConvergedError, DataError):  # a log that cannot be simulated, or a short one
-        gains.extend(_other_gains(result) if result.has_gains else ())
+    # Bodies connect the joints: a cause that the logs show explains what the fit finds of others.
+    settled, found = [_settled_delay(one, result) for one in examined], list[Finding]()
     causes = [one for one in settled if one.code in codes_with("names_cause")]
-    causes += [*gains, *_limits_found(result)]
-    known = {joint for one in causes for joint in one.joints}
-    bands = [one for one in _valid_bands(result) if not known.intersection(one.joints)]
-    of_fit = _of_fit(result, is_explained=bool(causes or bands))
-    return by_severity([*settled, *of_fit, *gains, *bands])
+    causes += _limits_found(result)
+    if result.has_gains and all(one.severity == "note" for one in causes):
+        with suppress(NotConvergedError, DataError):  # a log that cannot be simulated, or is short
+            found.extend(_other_gains(result))
+        found.extend([] if causes or found else _valid_bands(result))
+    of_fit = _of_fit(result, is_explained=bool(causes or found))
+    return by_severity([*settled, *of_fit, *found])
 
 
 def _of_fit(result: PositionIdentification, *, is_explained: bool) -> Iterator[Finding]:
@@ -411,7 +411,7 @@ def _of_fit(result: PositionIdentification, *, is_explained: bool) -> Iterator[F
     yield from _encoder_findings(result)
     for tried in result.fit.tried:
         figures: Any = {"terms": " and ".join(tried.terms), "gain_pct": 100 * tried.gain}
-        if tried.dropped:
+        if tried.dropped and not is_explained:
             yield finding("friction_dropped", "", tried.joint, **figures, dropped=tried.dropped)
         elif tried.is_chosen:
             yield finding("friction_found", "", tried.joint, **figures)
@@ -433,9 +433,8 @@ def _settled_delay(examined: Finding, result: PositionIdentification) -> Finding
         known = "its standard error belongs to the bound, not to the delay"
         remedy = f"{examined.remedy}. The delay of the fit is 0, its lower bound: {known}"
         return examined.reworded(remedy=remedy)
-    span = examined.evidence["longest"] - examined.evidence["shortest"]
     error = max(errors, default=0.0)
-    if error > _KNOWN * span:
+    if error > _KNOWN * examined.evidence["longest"]:
         return examined
     what, figures = "fitted" if errors else "stated", {**examined.evidence, "std_error": error}
     return finding("slow_command:known", examined.log, examined.joints, what=what, **figures)
@@ -456,17 +455,11 @@ def _at_bound(result: PositionIdentification, *, is_explained: bool) -> Iterator
     }
     if at_zero := [name for name in at_bound if name not in {**largest, **least}]:
         stated = [name for name in ("kp", "kd", "delay") if getattr(loop, name) is not None]
-        gains, remedies = [name for name in stated if name != "delay"], []
+        gains = [name for name in stated if name != "delay"]
         is_wrong = bool(stated) and not is_explained
-        wrong = f", or {' or '.join(stated)} in [controller] is wrong" if is_wrong else ""
-        if gains and is_wrong:
-            remedies.append(f"compare {' and '.join(gains)} with the gains of the drive")
-        if "delay" in stated:
-            remedies.append("leave the delay out of [controller], so that it is fitted")
-        remedies.append(f"command a motion that excites {listed(at_zero, NAMED)} more")
-        todo = "; ".join(remedies)
-        todo = f"{todo[0].upper()}{todo[1:]}"
-        yield _named("at_bound:zero", at_zero, wrong=wrong, todo=todo)
+        words = {"stated": " or ".join(stated), "own": " and ".join(gains)}
+        todo = {"gains": is_wrong and bool(gains), "late": "delay" in stated}
+        yield _named("at_bound:zero", at_zero, wrong=is_wrong, **words, **todo)
     if least:
         yield _named("at_bound:least", [f"{name} = {x:.3g}" for name, x in least.items()])
     if any(name.endswith("delay") for name in at_zero):
@@ -526,7 +519,7 @@ def _stated_gains(
 
 def _valid_bands(result: PositionIdentification) -> Iterator[Finding]:
     """Yield up to which frequency the model predicts a joint whose position error is not small."""
-    for run in (result.validation or result.fitted) if result.has_gains else ():
+    for run in result.validation or result.fitted:
         for j in np.flatnonzero(_relative_errors(run) > GOOD_POSITION).tolist():
             band = run.valid_band(j)
             if band is not None and 100.0 * band["below"] < GOOD_POSITION:

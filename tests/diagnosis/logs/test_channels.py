@@ -76,11 +76,8 @@ def test_spikes_of_a_velocity_that_is_not_used_are_a_note():
     v = log.v.copy()
     v[[3000, 9000], 1] += 9.0
     log = replace(log, v=v)
-    for velocity, severity in (
-        ("auto", "error"),
-        ("measured", "error"),
-        ("differentiated", "note"),
-    ):
+    severities = {"auto": "error", "measured": "error", "differentiated": "note"}
+    for velocity, severity in severities.items():
         (found,) = found_of(log, "spikes", velocity=velocity)
         assert (found.where, found.severity) == ("run.csv: dq_b", severity)
     coarse = replace(log, v=np.round(v / 0.1) * 0.1)  # "auto" differentiates the position instead
@@ -192,8 +189,7 @@ def test_a_torque_is_noisy_from_three_tenths_of_its_standard_deviation_on(level,
 
 def test_the_noise_of_a_channel_is_its_standard_deviation():
     levels = {f.where: f.evidence for f in found_of(log_of_two(), "noise")}
-    assert levels["run.csv: tau"]["a"] == pytest.approx(0.05, rel=0.05)
-    assert levels["run.csv: tau"]["b"] == pytest.approx(0.05, rel=0.05)
+    assert levels["run.csv: tau"] == pytest.approx({"a": 0.05, "b": 0.05}, rel=0.05)
     assert levels["run.csv: q"]["a"] < 1e-6
 
 
@@ -421,9 +417,8 @@ def test_a_position_that_is_held_between_steps_is_not_stale():
 @pytest.fixture(scope="module")
 def slider():
     """A prismatic joint and one that turns."""
-    return RobotModel.from_urdf(
-        example_urdf("tiago.urdf"), joints=["torso_lift_joint", "arm_1_joint"]
-    )
+    joints = ["torso_lift_joint", "arm_1_joint"]
+    return RobotModel.from_urdf(example_urdf("tiago.urdf"), joints=joints)
 
 
 def moved(model, *ways):
@@ -433,8 +428,7 @@ def moved(model, *ways):
     for j, (first, last, speed) in enumerate(ways):
         v[first : last + 1, j] = speed
     q = np.cumsum(v, axis=0) / 100
-    segment = np.zeros(1001, dtype=int)
-    motion = Trajectory(t, q, v, 0 * v, 0 * v, model.joints, 100.0, segment)
+    motion = Trajectory(t, q, v, 0 * v, 0 * v, model.joints, 100.0, np.zeros(1001, dtype=int))
     return Log(t, q, 0 * q, model.joints, path="run.csv"), motion
 
 

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from helpers.corruptions import CASES, NOISE, ROBOTS, clean_log, controlled_log,
 from helpers.driven import arm
 from helpers.synthetic import exact_log, perfect, truth
 
-from robotid.base.findings import grouped
+from robotid.base.findings import Finding, grouped
 from robotid.cli import main
 from robotid.cli.doctor import doctor
 from robotid.cli.job import Job, LogEntry, read_job
@@ -20,6 +21,7 @@ from robotid.data.files.read import write_columns, write_log
 from robotid.data.log import REPEATED, Log, Trajectory, repeated_share
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
+from robotid.diagnosis.explanations import explained
 from robotid.diagnosis.logs.check_logs import check_excitation, diagnose, findings_to_dict
 from robotid.diagnosis.urdf.inspection import inspect_urdf
 from robotid.dynamics.base_parameters import structural_mapping
@@ -56,25 +58,21 @@ def loud(findings):
 
 def spoil(name, table, folder):
     """Return the job of a table as a case changes it."""
-    case = CASES[name]
-    path = folder / "run.csv"
+    case, path = CASES[name], folder / "run.csv"
     if name not in AT_100_HERTZ:
         table = {column: values[::2] for column, values in table.items()}
     write_columns(case.change(table), path)
-    urdf = example_urdf(case.urdf)
-    return Job(urdf=urdf, gravity=case.gravity, identification=(LogEntry(path),))
+    return Job(example_urdf(case.urdf), gravity=case.gravity, identification=(LogEntry(path),))
 
 
 @pytest.fixture(scope="module")
 def spoilt(table, tmp_path_factory):
     """The job of each spoilt table and what is found of it, examined once."""
-    made = {}
 
+    @cache
     def examined_once(name):
-        if name not in made:
-            job = spoil(name, table, tmp_path_factory.mktemp("spoilt"))
-            made[name] = job, examine(job)
-        return made[name]
+        job = spoil(name, table, tmp_path_factory.mktemp("spoilt"))
+        return job, examine(job)
 
     return examined_once
 
@@ -123,14 +121,12 @@ def test_a_fault_of_all_torques_that_hardly_shows_in_one_is_found(name, seed, tm
 
 
 def test_where_names_the_joint_and_the_evidence_says_how_much(spoilt):
-    _, findings = spoilt("one torque negated")
-    (found,) = [f for f in findings if f.code == "torque_sign"]
+    (found,) = (f for f in spoilt("one torque negated")[1] if f.code == "torque_sign")
     assert found.where == "run.csv: elbow_joint"
     assert found.evidence["unexplained"] == pytest.approx(0.30, abs=0.01)
     assert found.evidence["unexplained_if_negated"] < 0.005
     assert "negate tau_elbow_joint" in found.message
-    _, findings = spoilt("two torque columns swapped")
-    (found,) = [f for f in findings if f.code == "torque_order"]
+    (found,) = (f for f in spoilt("two torque columns swapped")[1] if f.code == "torque_order")
     assert found.where == "run.csv: shoulder_lift_joint, wrist_1_joint"
     assert "tau_wrist_1_joint is the torque of shoulder_lift_joint" in found.message
 
@@ -189,9 +185,8 @@ def test_one_reading_explains_the_torques_of_a_plant_by_pinocchio(ur5, name):
     assert {f.code for f in found} <= set(wanted) | {"excitation"}
     sizes = {"speed": 0.5, "offset": np.pi / 2, "factor": 0.02, "angle_deg": np.degrees(0.35)}
     for key, size in sizes.items():
-        assert [f.evidence[key] for f in found if key in f.evidence] == pytest.approx(
-            [size for f in found if key in f.evidence], rel=0.1
-        )
+        seen = [f.evidence[key] for f in found if key in f.evidence]
+        assert seen == pytest.approx([size] * len(seen), rel=0.1)
 
 
 def test_delays_are_measured_and_corrected_only_on_request(spoilt):
@@ -244,12 +239,21 @@ def test_a_drive_that_is_off_is_no_sign_of_its_torque(ur5, last, severity):
 
 def test_a_recording_that_is_fitted_twice_is_named(ur5, short):
     again = replace(short, path="again.csv", t=short.t + 3.0)
-    (found,) = [
-        f for f in diagnose(ur5, [short, clean_log(ur5, 1, duration=5.0), again], [], SIGNALS)
-        if f.code == "repeated_log"
-    ]  # fmt: skip
+    findings = diagnose(ur5, [short, clean_log(ur5, 1, duration=5.0), again], [], SIGNALS)
+    (found,) = [f for f in findings if f.code == "repeated_log"]
     assert (found.where, found.severity) == ("again.csv", "warning")
     assert f"the same recording as {short.name}" in found.message
+
+
+def test_an_origin_in_millimetres_is_the_only_cause(short, tmp_path):
+    text = Path(URDF).read_text().replace("0.0 -0.1197 0.425", "0.0 -119.7 425")
+    (tmp_path / "mm.urdf").write_text(text)
+    model = RobotModel.from_urdf(tmp_path / "mm.urdf")
+    (found,) = (f for f in diagnose(model, [short], [], SIGNALS) if f.severity != "note")
+    assert (found.code, found.severity) == ("origin_units", "error")
+    assert found.joints == ("elbow_joint",)
+    spring = Finding("spring", "warning", "elbow_joint", "", joints=found.joints)  # of a fit
+    assert [x.severity for x in explained([found, spring], model)] == ["error", "note"]
 
 
 # ---- the recordings of other laboratories
@@ -262,10 +266,8 @@ def whole(recordings, monkeypatch, name, *files):
 
 
 def test_ur10e_carries_a_load_and_moves_one_joint_at_a_time(recordings, monkeypatch):
-    job = whole(
-        recordings, monkeypatch, "ur10e", "ident_20200219_14harm_load", "ident_20200219_14harm"
-    )
-    findings = examine(job)
+    files = "ident_20200219_14harm_load", "ident_20200219_14harm"
+    findings = examine(whole(recordings, monkeypatch, "ur10e", *files))
     payload = {f.where.split(":")[0]: f for f in findings if f.code == "payload"}
     loaded = payload["ident_20200219_14harm_load.parquet"]
     assert loaded.severity == "warning"
@@ -286,8 +288,8 @@ def test_the_drive_of_a_recorded_pendulum_is_off(recordings, file):
 
 
 def test_motor_side_columns_are_refused_by_name(recordings, monkeypatch):
-    job = whole(recordings, monkeypatch, "tx40", "motor_side")
-    assert [f.code for f in examine(job)] == ["missing_column"]
+    findings = examine(whole(recordings, monkeypatch, "tx40", "motor_side"))
+    assert [f.code for f in findings] == ["missing_column"]
 
 
 # ---- command line and identify
@@ -339,27 +341,23 @@ def test_what_makes_a_result_wrong_leads_its_verdict_unless_it_is_ignored(
 
 
 def test_a_log_of_standing_still_is_said_to_be_one(short, tmp_path):
-    q = short.q
-    still = replace(short, q=np.tile(q[0], (len(q), 1)), v=np.zeros_like(q))
+    still = replace(short, q=0.0 * short.q + short.q[0], v=0.0 * short.q)
     write_log(still, tmp_path / "still.csv")
     job, stages = Job(Path(URDF), identification=(LogEntry(tmp_path / "still.csv"),)), []
     found = examine(job, progress=lambda *stage: stages.append(stage))
     assert {"no_motion", "static_joint"} <= loud(found)
-    names = "reading logs", "checking logs"
-    assert stages == [(name, k, 2, "stages") for k, name in enumerate(names)]
+    assert stages == [("reading logs", 0, 2, "stages"), ("checking logs", 1, 2, "stages")]
 
 
 @pytest.mark.parametrize("name", ["finger_edu.urdf", "so101.urdf", "double_pendulum.urdf"])
 def test_a_clean_log_of_a_small_arm_at_30_hertz_raises_no_alarm(name):
     model = RobotModel.from_urdf(example_urdf(name))
     rng = np.random.default_rng(0)
-    size = model.layout.n_inertial
-    pi = another_robot(model, rng)
+    size, pi = model.layout.n_inertial, another_robot(model, rng)
     # no tool of 1.2 kg: these arms would rightly be said to carry a load
     share = rng.uniform(0.8, 1.2, size // 10)
     pi[:size] = (model.standard_parameters()[:size].reshape(-1, 10) * share[:, None]).ravel()
-    motion = random_fourier(model, rng, period=10.0)
-    sensors = Sensors(noise=NOISE)
+    motion, sensors = random_fourier(model, rng, period=10.0), Sensors(noise=NOISE)
     log = perfect(model, pi, motion, rng, rate=30.0, duration=20.0, sensors=sensors)
     found = diagnose(model, [log], [], SignalSettings())
     assert [f.code for f in found if f.severity != "note"] == []

@@ -2,10 +2,11 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.corruptions import clean_log, controlled_log, late, robot, table_of
+from helpers.corruptions import clean_log, controlled_log, delayed, robot
 from helpers.synthetic import exact_log, truth
 
 from robotid.data.signal_settings import SignalSettings
@@ -18,6 +19,7 @@ from robotid.diagnosis.logs.probe import (
     smooth_motion,
     take_probe,
 )
+from robotid.diagnosis.logs.readings import Reading
 from robotid.diagnosis.logs.torque_checks import TorqueCheck, load_model
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
@@ -82,6 +84,13 @@ def test_a_dead_torque_does_not_make_others_suspect(ur5, ur5_log, value):
     assert not {"current_for_torque", "urdf_mismatch"} & {code for code, _ in found}
 
 
+def test_a_reading_starts_near_the_three_points_of_its_parabola():
+    shares = {-0.3: 0.1 + 1e-9, 0.0: 0.2, 0.3: 0.3}  # almost a line
+    made = {x: SimpleNamespace(share=np.array([y])) for x, y in shares.items()}
+    (start,) = Reading("x", (), lambda _, x: made[x], (), 0.3).started(made[0.0])
+    assert start.values == pytest.approx((-3.0,))
+
+
 def test_the_first_second_of_a_clean_log_has_no_scale(ur5):
     log = clean_log(ur5, 10)
     assert loads(ur5, replace(log, t=log.t[:150], q=log.q[:150], v=log.v[:150], tau=log.tau[:150])
@@ -93,9 +102,8 @@ def test_the_fit_is_the_least_squares_of_all_joints_and_drives(ur5, ur5_log):
     probe = take_probe(ur5, smooth_motion(ur5, ur5_log, SIGNALS))
     share = TorqueCheck.of(probe).share
     model = load_model(probe, share)
-    scale = 2.0
-    chi, theta, error = model.fit(scale)
-    assert model.misfit(scale) == pytest.approx(chi, rel=1e-9)
+    chi, theta, error = model.fit(2.0)
+    assert model.misfit(2.0) == pytest.approx(chi, rel=1e-9)
     N, n, bodies = len(probe.rows), 6, 6
     drives = drive_columns(ur5, probe.q, probe.v, probe.a)
     pi = ur5.standard_parameters()[: ur5.layout.n_inertial].reshape(-1, 10)
@@ -106,10 +114,7 @@ def test_the_fit_is_the_least_squares_of_all_joints_and_drives(ur5, ur5_log):
     for j in range(n):
         sigma = np.sqrt(0.05**2 + share[j]) * probe.tau[:, j].std() / np.sqrt(20.0 / N)
         own = np.column_stack([np.einsum("kbi,bi->kb", Y[:, j], pi), Y[:, j, -1, :4]])
-        drive = drives[:, j]
-        others = np.zeros((N, n * drive.shape[1]))
-        others[:, j * drive.shape[1] : (j + 1) * drive.shape[1]] = drive
-        rows.append(np.hstack([own, others]) / scale / sigma)
+        rows.append(np.hstack([own, np.kron(np.eye(n)[j], drives[:, j])]) / 2.0 / sigma)
         right.append(probe.tau[:, j] / sigma)
     rows[0] = np.hstack([rows[0], np.zeros((10, rows[1].shape[1] - 10))])
     A, b = np.vstack(rows), np.concatenate(right)
@@ -169,11 +174,6 @@ def found(model, log, signals=SIGNALS):
     return list(torque_delay.check_torque_delay(model, log, signals, "run.csv"))
 
 
-def delayed(log, delay):
-    table = late("tau_", delay)(table_of(log))
-    return replace(log, tau=np.column_stack([table[f"tau_{joint}"] for joint in log.joints]))
-
-
 @pytest.mark.parametrize(("name", "seed", "duration"), CLEAN)
 def test_a_short_clean_log_has_no_late_torque_but_a_delayed_one_has(name, seed, duration):
     model, log = robot(name), controlled_log(name, seed, duration=duration)
@@ -221,9 +221,8 @@ def test_all_rows_from_the_first_to_the_last_that_moves_are_used(ur5):
 
 def test_joints_that_hardly_move_have_no_say(ur5):
     log = clean_log(ur5, 100, duration=20.0)
-    still = np.abs(log.t - 8.5) > 0.95
     q = log.q.copy()
-    q[still, :5] = q[850, :5]
+    q[np.abs(log.t - 8.5) > 0.95, :5] = q[850, :5]
     assert found(ur5, replace(log, q=q)) == []
 
 
@@ -234,8 +233,7 @@ def test_a_torque_that_is_periodic_in_the_position_is_no_delay(name, seed):
     tau = log.tau.copy()
     for torque, q in zip(tau.T, log.q.T, strict=True):
         phase, size = rng.uniform(0, 2 * np.pi, 4), rng.standard_normal(4)
-        waves = [np.cos(k * q + p) for k, p in zip((1, 2, 3, 4), phase, strict=True)]
-        ripple = size @ waves
+        ripple = size @ [np.cos(k * q + p) for k, p in enumerate(phase, start=1)]
         torque += 0.3 * torque.std() * ripple / ripple.std()
     for finding in found(model, replace(log, tau=tau)):
         assert finding.severity == "note"

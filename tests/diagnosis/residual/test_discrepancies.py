@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.corruptions import delayed
 from helpers.misfits import EFFECTS, log_with
 from helpers.paths import ROOT
 
@@ -17,6 +18,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.residual.discrepancies import alterations, explain_residual, readings
 from robotid.diagnosis.residual.misfit import find_misfits, settled
 from robotid.diagnosis.residual.term_trials import take_sample
+from robotid.diagnosis.verdict.fit_findings import fit_findings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import inverse_dynamics
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
@@ -38,11 +40,12 @@ def model():
 SETTINGS = EstimatorSettings(prior_weight=1.0)
 
 
-def fitted(model, logs, estimator=SETTINGS):
-    """Return the fit of a log, with plain friction, beside one kept apart."""
+def fitted(model, logs, estimator=SETTINGS, families=None):
+    """Return the fit of a log, with plain friction or families, beside one kept apart."""
     own, kept = ([hold_log(model, log, SignalSettings())] for log in logs)
     recordings = Recordings(model, structural_mapping(model), own, kept)
-    return with_drives(recordings, estimator, wanted_families("viscous+coulomb", model.joints))
+    families = families or wanted_families("viscous+coulomb", model.joints)
+    return with_drives(recordings, estimator, families)
 
 
 def found(model, change, robot="ur5_robot.urdf", turn=None, duration=16.0, estimator=None):
@@ -174,9 +177,8 @@ def named(findings):
     return [(finding.code, finding.where) for finding in findings]
 
 
-@pytest.mark.parametrize(
-    ("offset", "size", "rate"), [(0.1, 1.0, 50.0), (0.03, 3.0, 100.0)]
-)  # what explains more
+# what explains more
+@pytest.mark.parametrize(("offset", "size", "rate"), [(0.1, 1.0, 50.0), (0.03, 3.0, 100.0)])
 def test_a_spring_is_named_beside_a_zero_that_is_off(model, offset, size, rate):
     how = {"effect": "spring", "size": size, "rate": rate}
     alone, (spring,), others = both(model, model, 3, 2, offset, **how)
@@ -233,14 +235,18 @@ def test_a_joint_axis_of_another_direction_is_named(model, tmp_path, joint, key,
 
 
 def test_the_delay_of_one_torque_is_named(model):
-    def change(log):
-        tau = log.tau.copy()
-        tau[:, 2] = np.interp(log.t - 0.02, log.t, tau[:, 2])
-        return replace(log, tau=tau)
-
-    (first,) = found(model, change)
+    (first,) = found(model, lambda log: delayed(log, 0.02, "elbow"))
     assert (first.code, first.where) == ("joint_delay", "elbow_joint")
     assert first.evidence["size"] == pytest.approx(0.02, rel=0.25)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.06])
+def test_a_delay_that_was_selected_as_a_drive_term_is_named(four, delay):
+    plain = [log_with(four, 3, part=part, rate=50.0, duration=10.0) for part in (0, 1)]
+    logs = [delayed(log, delay, "shoulder_pan") for log in plain]
+    found = fit_findings(fitted(four, logs, families=dict.fromkeys(four.joints)))
+    sizes = [one.evidence["size"] for one in found if one.code == "joint_delay"]
+    assert sizes == pytest.approx([delay] * bool(delay), rel=0.25)
 
 
 def test_a_base_that_is_off_the_level_by_two_degrees_is_named(model):
@@ -271,15 +277,11 @@ def test_a_constant_force_on_the_flange_is_named_with_its_size(model):
     assert "changes in time" not in first.message
 
 
-def pushed(t):
-    return 25.0 * np.sin([2.1 * t, 1.7 * t + 1.0, 1.3 * t + 2.0])
-
-
 @pytest.mark.parametrize(
-    ("force", "gravity", "code"),
+    ("code", "force", "gravity"),
     [
-        (pushed, lambda t: 0.0, "external_force"),
-        (lambda t: np.zeros(3), lambda t: 0.4 * np.sin(0.3 * t), "moving_gravity"),
+        ("external_force", lambda t: 25 * np.sin(np.r_[2, 1.7, 1.3] * t + range(3)), np.zeros_like),
+        ("moving_gravity", lambda t: np.zeros(3), lambda t: 0.4 * np.sin(0.3 * t)),
     ],
 )
 def test_a_force_or_gravity_that_changes_in_time_is_the_only_finding(model, force, gravity, code):

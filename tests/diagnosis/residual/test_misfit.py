@@ -249,6 +249,8 @@ def test_a_term_stands_for_what_the_doctor_guessed_of_its_torque(three):
     assert (term.severity, term.evidence["replaces"]) == ("warning", 2.0)
     assert "It explains urdf_mismatch, unexplained_torque and" in term.message
     assert [doubt.joint for doubt in warnings_of([term], three.joints)] == [LIFT]
+    certain = Finding("current_for_torque", "warning", "run.csv", "", {"gain": 3.0})
+    assert settled([certain], [term])[0] == certain
     assert said("position_offset", 90.0)[0] == [2, 3]
     assert said("load_friction", 90.0)[0] == [0, 2, 3]
     assert said("spring", 90.0, validation_share_pct=8.0)[0] == [0, 1, 2, 3]

@@ -137,6 +137,8 @@ FAULTS = [
     ('xyz="0.5 0 0"', 'xyz="${l} 0 0"', "not_a_number", "joint elbow", "error", "'${l} 0 0'"),
     ('lower="-1"', 'lower=""', "not_a_number", "joint shoulder", "error", "limit lower is ''"),
     ('damping="0.5"', 'damping="nan"', "not_a_number", "joint shoulder", "error", "damping"),
+    ('xyz="0.5 0 0"', 'xyz="500 0 0"', "origin_units", "joint elbow", "error", "'elbow' is 500 m"),
+    ('xyz="0.2 0 0"', 'xyz="200 0 0"', "inertial_units", "link lower", "warning", "m: lower."),
 ]  # fmt: skip
 
 

@@ -90,16 +90,14 @@ def test_a_load_in_the_hand_is_no_other_scale(four):
 )
 def test_a_load_without_mass_confirms_no_scale(factor, mass, contradicts):
     """Only a load with a mass of its own may be left out of gravity and total mass."""
-    scale_check = ScaleCheck(
-        scale=1.01, factor=factor, masses=(20.0, mass, 0.0), unexplained=(0.2, 0.01)
-    )
-    assert not scale_check.agrees
-    assert scale_check.contradicts is contradicts
-    said, state = scale_check.message, "contradicts the URDF" if contradicts else "not verified"
+    check = ScaleCheck(scale=1.01, factor=factor, masses=(20.0, mass, 0.0), unexplained=(0.2, 0.01))
+    assert not check.agrees
+    assert check.contradicts is contradicts
+    said, state = check.message, "contradicts the URDF" if contradicts else "not verified"
     assert said.startswith(f"absolute scale {state}: ")
     assert f"gravity torque {factor:.2f} x the URDF's, total mass {mass:.4g} kg" in said
-    assert replace(scale_check, factor=1.05 - 1e-9, masses=(20.0, 20.8, 0.0)).agrees
-    assert replace(scale_check, factor=1.05 + 1e-9, masses=(20.0, 20.8, 0.7)).agrees
+    assert replace(check, factor=1.05 - 1e-9, masses=(20.0, 20.8, 0.0)).agrees
+    assert replace(check, factor=1.05 + 1e-9, masses=(20.0, 20.8, 0.7)).agrees
 
 
 def test_without_gravity_nothing_bears_witness(four):
@@ -115,13 +113,11 @@ def test_a_result_that_its_prior_holds_back_bears_no_witness(four, rng):
     size = four.layout.n_inertial
     pi[:size] = 3.0 * four.standard_parameters()[:size]  # the sensors say three times the URDF
     log = exact_log(four, pi, rng, samples=1000, noise=0.5)
-    kept = EstimatorSettings(prior_weight=1e9)
-    held = identify(four, [log], estimator=kept)
+    held = identify(four, [log], estimator=EstimatorSettings(prior_weight=1e9))
     assert held.scale_check.factor == pytest.approx(1.0, abs=0.05)  # it stays at the URDF
     assert not held.scale_check.follows
     assert not held.scale_check.agrees
-    free = identify(four, [log], estimator=EstimatorSettings())
-    assert free.scale_check.follows
+    assert identify(four, [log], estimator=EstimatorSettings()).scale_check.follows
 
 
 def bodies_of(rng, count):

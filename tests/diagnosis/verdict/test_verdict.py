@@ -41,17 +41,9 @@ def joint(error, *, urdf=100.0, constant=True, **others):
     return JointMetrics(1.0, "N m", error, r2, 100, {"urdf": urdf} | others, constant)
 
 
-def judged(
-    fit, validation, *, joints=(), refitted=(), log_errors=(), warnings=(), scale_check=None, **open
-):
-    predictions = Predictions(fit, validation, joints, refitted)
-    return judge(
-        predictions,
-        Determined(**open),
-        log_errors=log_errors,
-        warnings=warnings,
-        scale_check=scale_check,
-    )
+def judged(fit, validation, *, joints=(), refitted=(), **values):
+    beside = {x: values.pop(x) for x in ("log_errors", "warnings", "scale_check") if x in values}
+    return judge(Predictions(fit, validation, joints, refitted), Determined(**values), **beside)
 
 
 def verdict(validation, fitted=None, **open):
@@ -94,14 +86,12 @@ def test_alarms_come_before_everything_and_constants_before_the_rest():
 
 def test_each_joint_has_a_verdict_of_its_own():
     joints = {"a": joint(4.0), "b": joint(20.0), "c": joint(40.0, constant=False)}
-    found = verdict(joints, fitted={name: joint(3.0) for name in "abcd"}).joints
-    assert {name: v.status for name, v in found.items()} == {
-        "a": "good", "b": "usable", "c": "poor", "d": "not evaluated",
-    }  # fmt: skip
-    assert found["a"].reasons[0].startswith("error at most 4.0 %")
-    reason = found["c"].reasons[0]
-    assert reason.startswith("c: worse than a constant torque on val.csv: error 40.0 %")
-    assert found["d"].reasons == ("it does not move in any validation log",)
+    found = verdict(joints, fitted={name: joint(3.0) for name in "abcd"})
+    assert statuses(found) == {"a": "good", "b": "usable", "c": "poor", "d": "not evaluated"}
+    (a, *_), _, (c, *_), d = (one.reasons for one in found.joints.values())
+    assert a.startswith("error at most 4.0 %")
+    assert c.startswith("c: worse than a constant torque on val.csv: error 40.0 %")
+    assert d == ("it does not move in any validation log",)
 
 
 def test_the_good_joint_with_the_largest_error_has_the_cause_of_its_residual():
@@ -128,9 +118,7 @@ def test_a_doubt_makes_its_joint_and_the_whole_usable_at_best():
     logs = {"val.csv": Metrics({"a": joint(4.0), "b": joint(4.0), "c": joint(60.0)}, 1.0)}
     warnings = [VerdictWarning("clipped", name, "it is clipped") for name in "bc"]
     found = judged(Metrics(fit, 1.0), logs, warnings=warnings)
-    assert {name: v.status for name, v in found.joints.items()} == {
-        "a": "good", "b": "usable", "c": "poor",
-    }  # fmt: skip
+    assert statuses(found) == {"a": "good", "b": "usable", "c": "poor"}
     assert found.joints["b"].reasons == ("b: it is clipped (clipped)",)
     assert "b, c: it is clipped (clipped)" in found.reasons
     assert found.status == "poor"
@@ -250,9 +238,8 @@ def test_a_hypothesis_is_refuted_by_the_worst_of_all_logs_of_its_joints():
 def test_a_current_is_refuted_by_the_gravity_of_every_joint(gravity, severity):
     logs, scale_check = kept_logs(one=(1.0, 1.0)), ScaleCheck(dict(zip("ab", gravity, strict=True)))
     for kind in ("warning", "error"):
-        (found,) = rejected(
-            [finding("current_for_torque", "run.csv: a, b", kind)], logs, scale_check
-        )
+        guess = finding("current_for_torque", "run.csv: a, b", kind)
+        (found,) = rejected([guess], logs, scale_check)
         assert found.severity == (severity if severity == "note" else kind)
 
 
@@ -368,7 +355,7 @@ def test_uses_follow_from_joints_consistency_and_scale(statuses, scale_check, ch
 def test_no_use_contradicts_the_error_of_a_joint():
     logs = {"val.csv": Metrics({"a": joint(15.1), "b": joint(14.9)}, 1.0)}
     found = judged(Metrics({"a": joint(14.0), "b": joint(14.0)}, 1.0), logs, scale_check=VERIFIED)
-    assert {name: one.status for name, one in found.joints.items()} == {"a": "usable", "b": "good"}
+    assert statuses(found) == {"a": "usable", "b": "good"}
     assert set(found.use_for.values()) == {"yes, without a"}
 
 

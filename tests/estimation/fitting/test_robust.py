@@ -12,6 +12,8 @@ from robotid.base.exceptions import SettingsError
 from robotid.data.files.read import lay_out, write_log
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.verdict.fit_findings import fit_findings
+from robotid.diagnosis.verdict.verdict import warnings_of
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.prepared_logs import base_problem
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
@@ -71,6 +73,8 @@ def test_five_outliers_of_1000_newton_metres_move_it_by_less_than_its_standard_e
     assert undisturbed.outliers == ()
     plain, ruined = (fit(model, [log], estimator=name) for log in (clean, bad))
     assert np.max(np.abs(ruined.base - plain.base) / plain.base_error) > 5.0
+    said = [[x for x in fit_findings(one) if x.code == "outliers"] for one in (found, ruined)]
+    assert [len(warnings_of(own, model.joints)) for own in said] == [0, 1]
     assert np.median(np.abs(undisturbed.base - plain.base) / plain.base_error) < 0.4
 
 

@@ -6,6 +6,7 @@ import pinocchio as pin
 import pytest
 from helpers.mujoco_plant import assert_recovered, held, multisine, plant, recorded
 
+from robotid.base.findings import Finding
 from robotid.data.log import Log
 from robotid.diagnosis.catalogue import finding
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows
@@ -26,7 +27,7 @@ SETTINGS = SimulationSettings(window=1.0, lead=0.3, bodies=0.0, step=2e-3)
 COARSE = replace(SETTINGS, step=5e-3)  # more than a row of 250 Hz: the fit halves rows
 
 
-SLOW = finding("slow_command", "log", "hip", frequency=2.0, shortest=0.0, longest=0.09)
+SLOW = finding("slow_command", "log", "hip", frequency=2.0, longest=0.09)
 
 
 def stated(robot, **changes):
@@ -282,6 +283,9 @@ def test_a_log_with_other_gains_is_named_with_their_ratio(found, other_log):
         np.testing.assert_allclose(gains, RATIOS, rtol=0.15)
         assert one.evidence["after"] < 0.3 * one.evidence["before"]
         assert "times its value in the fit: with other gains its position error" in one.message
+    other = replace(found, validation=(run,))
+    stop = Finding("end_stop", "warning", "", "", joints=other_log.joints[:1])  # another cause
+    assert not [one for one in loop_findings(other, [stop]) if one.code == "other_gains"]
     assert not [one for one in loop_findings(found, ()) if one.code == "other_gains"]
 
 

@@ -14,7 +14,7 @@ from robotid.data.log import Log
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows
 from robotid.dynamics.torque import predict_instants
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
-from robotid.identification.closed_loop.from_commands import identify_loops
+from robotid.identification.closed_loop.from_commands import identify_loops, loop_findings
 from robotid.identification.closed_loop.initial_values import (
     CLEAR,
     _Motion,
@@ -227,6 +227,7 @@ def test_a_chosen_term_with_negative_friction_is_dropped_and_the_fit_goes_on(mod
     [finding] = [f for f in found.findings if f.code.startswith("friction")]
     assert (finding.code, finding.severity, finding.where) == ("friction_dropped", "warning", "j")
     assert "rad, expected 0 or more. The term was dropped" in finding.message
+    assert finding not in loop_findings(found, [replace(finding, code="end_stop")])  # its cause
     [tried] = [t for t in found.fit.tried if t.dropped]
     assert (tried.terms, tried.is_chosen) == (("stribeck",), False)
     assert [term.name for term in found.fit.loops.terms[0]] == ["viscous", "coulomb", "offset"]
