@@ -150,10 +150,9 @@ def _reasons(model: RobotModel, J: Array, sides: dict[str, Array]) -> dict[str, 
     """Return the code of each body that is not usable: J (n, 4, 4), sides of its box (3,) [m]."""
     bodies = model.layout.bodies
     mass, least = J[:, 3, 3], np.linalg.eigvalsh(J)[:, 0]
-    scale = np.trace(J, axis1=1, axis2=2)
     codes = dict.fromkeys(bodies, "")
     codes |= {body: "default_inertial" for body in _placeholders(model)}
-    is_impossible, has_mass = least < -SLACK * scale, mass > 0
+    is_impossible, has_mass = least < -SLACK * np.trace(J, axis1=1, axis2=2), mass > 0
     codes |= dict.fromkeys(compress(bodies, is_impossible), "not_positive_definite")
     codes |= dict.fromkeys(compress(bodies, ~has_mass), "missing_inertial")
     centre = np.linalg.norm(J[:, :3, 3], axis=1) / np.maximum(mass, TINY)

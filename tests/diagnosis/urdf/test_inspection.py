@@ -64,12 +64,9 @@ def test_a_clean_robot_has_no_finding(tmp_path):
     assert content["joints"] == ["shoulder", "elbow"]
     structure = content["structure"]
     # a planar arm in the vertical plane: 2 x (m c_x, m c_z, I) with the second mass grouped
-    assert {key: structure[key] for key in ("standard", "base_inertial", "base", "rank")} == {
-        "standard": 20,
-        "base_inertial": 6,
-        "base": 6 + 8 - 1,  # the armature of the first joint acts like an inertia of its link
-        "rank": 13,
-    }
+    # the armature of the first joint acts like an inertia of its link: 6 + 8 - 1 = 13
+    sizes = [structure[key] for key in ("standard", "base_inertial", "base", "rank")]
+    assert sizes == [20, 6, 13, 13]
     assert 1 <= structure["condition"] < 1e3
     assert len(content["base_groups"]) == 6
     assert "upper.mcy" in structure["undetermined"]
