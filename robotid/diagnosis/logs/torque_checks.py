@@ -88,9 +88,8 @@ def _findings(samples: Samples, found: Sequence[Best], log: str) -> Iterator[Fin
     exchanged: dict[str, list[Best]] = {}
     for one in found:
         reading, named = one.reading, one.reading.joints or rows
-        concerned = np.isin(rows, named)
         # a joint without any torque of the bodies does not confirm that reading
-        concerned &= one.samples.urdf_size > ZERO * samples.urdf_size
+        concerned = np.isin(rows, named) & (one.samples.urdf_size > ZERO * samples.urdf_size)
         is_unit = reading.code == "current_for_torque" and not reading.joints
         if is_unit or (concerned.any() and np.median(final[concerned]) > EXPLAINED):
             continue  # a unit of all torques shows in the masses
@@ -235,10 +234,10 @@ def _check_loads(probe: Probe, share: Array, name: str, is_explained: bool) -> I
         if scale != 1.0 and model.is_this_robot(scale):
             used = np.array(probe.model.joints)[model.R.any(axis=(1, 2))].tolist()
             is_unit = len(used) == len(share) and abs(np.log(scale)) > np.log(_OTHER_UNIT)
-            named = used if len(used) < len(share) else ()
             yield finding(
-                "current_for_torque", name, named, joints=len(used), also=False,
-                severity="error" if is_unit else "warning", factor=scale, joint=listed(used),
+                "current_for_torque", name, used if len(used) < len(share) else (), also=False,
+                joints=len(used), severity="error" if is_unit else "warning", factor=scale,
+                joint=listed(used),
             )  # fmt: skip
         elif is_better or _error_of_links(theta) > _MISMATCH:
             factors = dict(zip(probe.model.layout.bodies, theta[:-4].tolist(), strict=True))
@@ -251,11 +250,13 @@ def _check_loads(probe: Probe, share: Array, name: str, is_explained: bool) -> I
 
 def _subtracted(probe: Probe, model: LoadModel) -> str:
     """Return what of the URDF's torque is missing, with which the torques fit the URDF's masses."""
-    still = np.zeros_like(probe.v)
-    weight = replace(probe, v=still, a=still).loads.sum(axis=2)
-    whole = TorqueCheck.of(replace(probe, tau=probe.tau + weight))
-    chi, theta, _ = load_model(whole.probe, whole.share).fit()
-    if chi < decisions.BETTER * model.misfit(1.0) and _error_of_links(theta) < _MISMATCH:
+    weight = replace(probe, v=0.0 * probe.v, a=0.0 * probe.a).loads.sum(axis=2)
+    check = TorqueCheck.of(replace(probe, tau=probe.tau + weight))
+    whole, urdf = load_model(check.probe, check.share), np.append(model.mean, -1.0)
+    chi, theta, _ = whole.fit()
+    before, after = (np.sum((x.R @ urdf) ** 2, axis=1) for x in (model, whole))
+    agree = (after <= decisions.TENFOLD * before).all()  # no joint contradicts it
+    if agree and _error_of_links(theta) < _MISMATCH and chi < decisions.BETTER * model.misfit(1.0):
         return "robot"
     R, rows = model.R.copy(), np.arange(len(model.R))
     R[..., -1] += R[..., :-5].sum(axis=-1)  # the torque of all links

@@ -1,8 +1,8 @@
 """Content of result.json for an identification and for a preview."""
 
-import dataclasses
 import math
 from collections.abc import Mapping
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -87,7 +87,7 @@ def _torque_entries(found: TorqueIdentification, settings: Mapping[str, Any]) ->
         "motors": _motors(found, settings),
         "friction": {drive.joint: _friction(found, drive) for drive in found.drives},
         "consistency": {
-            "mass_matrix": dataclasses.asdict(found.mass_matrix),
+            "mass_matrix": asdict(found.mass_matrix),
             "fit": dict(found.estimate.details),
             "sources": {kind: found.sources.count(kind) for kind in SOURCES},
         },
@@ -203,8 +203,7 @@ def _expected_torque(preview: "Preview") -> dict[str, dict[str, Any]]:
     found, bands, model = preview.expected, preview.bands, preview.expected.model
     tau = np.vstack([e.recording.trajectory.tau for e in found.fitted])
     rms, half = np.sqrt(np.mean(tau**2, axis=0)), QUANTILE * rms_error(bands)
-    alone = [dataclasses.replace(band, noise=0.0 * band.noise) for band in bands]
-    of_parameters = QUANTILE * rms_error(alone)
+    of_parameters = QUANTILE * rms_error([replace(x, noise=0.0 * x.noise) for x in bands])
     return {
         row: {
             "rms": float(rms[j]),
@@ -222,7 +221,7 @@ def input_entries(found: Identification) -> list[dict[str, Any]]:
     inputs = [{"role": "urdf", **source_entry(found.model.tree.path)}]
     for role, evaluations in (("identification", found.fitted), ("validation", found.validation)):
         for e in evaluations:
-            signals = dataclasses.asdict(e.recording.signals) if isinstance(e, Evaluation) else {}
+            signals = asdict(e.recording.signals) if isinstance(e, Evaluation) else {}
             source = source_entry(e.log.path)
             inputs.append({"role": role, **source, **_extent(e), "signals": signals})
     return inputs
@@ -320,7 +319,7 @@ def loop_entries(found: "PositionIdentification") -> dict[str, Any]:
                 "parameters": len(estimate.theta),
                 "correlation": [float(rho) for rho in estimate.details["correlation"]],
             },
-            "friction_tried": [dataclasses.asdict(tried) for tried in found.fit.tried],
+            "friction_tried": [asdict(tried) for tried in found.fit.tried],
             "identification": [e.to_dict() for e in found.fitted],
         },
     }
