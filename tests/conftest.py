@@ -47,10 +47,10 @@ def pytest_make_collect_report(collector):
 LONGEST = (
     "dynamics/test_compiled.py diagnosis/logs/test_example_robots.py "
     "dynamics/simulation/test_loops.py identification/test_floating_base.py test_docs.py "
-    "output/report/test_reading.py cli/test_real_recordings.py output/viewer/test_browser.py "
-    "diagnosis/logs/test_diagnosis.py estimation/test_workers.py figures/test_loops.py "
-    "identification/test_long_recordings.py identification/closed_loop/test_limits.py "
-    "cli/test_five_minutes.py cli/test_long_work.py test_hostile_inputs.py"
+    "diagnosis/logs/test_diagnosis.py diagnosis/residual/test_discrepancies.py "
+    "cli/test_real_recordings.py output/viewer/test_browser.py estimation/test_workers.py "
+    "figures/test_loops.py identification/test_long_recordings.py cli/test_five_minutes.py "
+    "identification/closed_loop/test_limits.py cli/test_long_work.py test_hostile_inputs.py"
 )
 
 

@@ -260,7 +260,7 @@ def test_gravity_is_compensated_without_the_offset(follow, demo):
 
 
 def test_a_drive_at_its_limit_is_found(follow):
-    assert "at the effort limit" in follow("how_to/saturation.md")
+    assert "at the effort limit" in follow("how_to/saturation.md", "--seconds 60")
 
 
 def test_the_notebook_of_first_steps_runs_and_shows_what_it_says(tmp_path, monkeypatch, capsys):

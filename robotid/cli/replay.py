@@ -76,8 +76,7 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
     for path in map(Path, paths):
         files = [path]
         if path.is_dir():
-            names = ("result.json", "track.json")
-            files = [path / name for name in names if (path / name).is_file()]
+            files = [path / x for x in ("result.json", "track.json") if (path / x).is_file()]
         if not files:
             raise DataError(f"{str(path)!r} has no result.json and no track.json")
         beside.append(files[0].parent)
@@ -313,6 +312,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
+    if options.source.endswith(".toml"):
+        raise SettingsError(f"{options.source} is a job file, expected URDF LOG [RESULT ...]")
     findings = read_findings(options.results)
     if options.results:
         refuse_log_flags(options, "a RESULT has the settings of its logs")

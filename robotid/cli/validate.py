@@ -148,9 +148,8 @@ def _expected(
     noise = np.array([of_fit.get(row, {}).get("rmse") or 0.0 for row in model.row_names])
     recording, mapping = evaluation.recording, structural_mapping(model)
     C = covariance if between is None else covariance + between
-    motion = recording.trajectory
-    band = torque_band(model, mapping, motion, mapping.K @ C @ mapping.K.T, noise)
-    inside = band.coverage(motion.tau, evaluation.torques["estimate"], recording.mask)
+    band = torque_band(model, mapping, recording.trajectory, mapping.K @ C @ mapping.K.T, noise)
+    inside = band.coverage(recording.trajectory.tau, evaluation.torques["estimate"], recording.mask)
     per_joint = {
         row: {"rmse": float(error), "within_95_pct": finite(100.0 * share)}
         for row, error, share in zip(model.row_names, rms_error([band]), inside, strict=True)

@@ -229,8 +229,7 @@ def _conditioned(
         return _Refined(i, families, weighted, (bool(_at_bound(drive, families).any()), is_grown))
 
     def left_of(other: _Refined) -> float:
-        families = other.families
-        return float(_Options.of(sample, drive, families).left(range(len(families))).sum())
+        return float(_Options.of(sample, drive, other.families).left(range(len(chosen) + 1)).sum())
 
     first = refined(best)
     if not any(first.faults):

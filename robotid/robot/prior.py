@@ -37,7 +37,6 @@ _DENSITY = 1000.0  # [kg/m^3] without a body to take it from
 _COPIES = 3  # identical isotropic inertials are placeholders
 # medians over the bodies of all robots in example-robot-data: at most 2e4 kg/m^3 and 7
 _DENSEST = 5e4  # [kg/m^3] over the box of a body's frames; with masses in g 1e5 and more
-THIN = 0.01  # [m] least size of a body: thin sheets have a volume
 FARTHEST = 30.0  # RMS distance of the mass from the joint over that box; in mm 160 and more
 
 
@@ -151,25 +150,31 @@ def _reasons(model: RobotModel, J: Array, sides: dict[str, Array]) -> dict[str, 
     """Return the code of each body that is not usable: J (n, 4, 4), sides of its box (3,) [m]."""
     bodies = model.layout.bodies
     mass, least = J[:, 3, 3], np.linalg.eigvalsh(J)[:, 0]
-    scale = np.trace(J, axis1=1, axis2=2)
     codes = dict.fromkeys(bodies, "")
     codes |= {body: "default_inertial" for body in _placeholders(model)}
-    is_impossible, has_mass = least < -SLACK * scale, mass > 0
+    is_impossible, has_mass = least < -SLACK * np.trace(J, axis1=1, axis2=2), mass > 0
     codes |= dict.fromkeys(compress(bodies, is_impossible), "not_positive_definite")
     codes |= dict.fromkeys(compress(bodies, ~has_mass), "missing_inertial")
     centre = np.linalg.norm(J[:, :3, 3], axis=1) / np.maximum(mass, TINY)
-    second = np.trace(J[:, :3, :3], axis1=1, axis2=2) / np.maximum(mass, TINY)
-    gyration = np.sqrt(np.maximum(second - centre**2, 0.0)) + THIN
-    codes |= dict.fromkeys(compress(bodies, centre > FARTHEST * gyration), "inertial_units")
+    codes |= dict.fromkeys(compress(bodies, centre > FARTHEST * body_sizes(J)), "inertial_units")
     sized = [k for k, body in enumerate(bodies) if mass[k] > 0 and body in sides]
     if sized:
         size = np.array([sides[bodies[k]] for k in sized])
         density = np.median(mass[sized] / size.prod(axis=1))
-        distance = np.median(np.sqrt(np.abs(second[sized])) / np.linalg.norm(size, axis=1))
+        second = np.abs(np.trace(J[sized, :3, :3], axis1=1, axis2=2)) / mass[sized]
+        distance = np.median(np.sqrt(second) / np.linalg.norm(size, axis=1))
         if density > _DENSEST or distance > FARTHEST:
             codes |= dict.fromkeys(compress(bodies, has_mass), "inertial_units")
     negligible = negligible_bodies(model)  # as between the axes of a ball joint
     return {body: code for body, code in codes.items() if code and body not in negligible}
+
+
+def body_sizes(J: Array) -> Array:
+    """Return the radius of gyration of bodies, at least the side of a cube of water, (n,) [m]."""
+    mass = np.maximum(J[:, 3, 3], TINY)
+    squares = np.trace(J[:, :3, :3], axis1=1, axis2=2) / mass
+    squares -= np.sum(J[:, :3, 3] ** 2, axis=1) / mass**2
+    return np.asarray(np.sqrt(np.maximum(squares, np.cbrt(mass / _DENSITY) ** 2)))
 
 
 def _placeholders(model: RobotModel) -> set[str]:

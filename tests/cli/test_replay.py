@@ -216,10 +216,10 @@ def test_a_base_is_where_the_log_says_or_said_to_be_held(tmp_path, capsys):
     capsys.readouterr()
     base[:, 3:] *= 0.5
     assert play(np.column_stack([rows, base]), [*columns, *names]) is None
-    assert (
-        "log.csv: the quaternion of the base has length 0.5 in row 0, expected 1"
-        in capsys.readouterr().err
-    )
+    words = "log.csv: the quaternion of the base has length 0.5 in row 0, expected 1"
+    assert words in capsys.readouterr().err
+    assert main(["replay", "job.toml", "result"]) == 2
+    assert "job.toml is a job file, expected URDF LOG [RESULT ...]" in capsys.readouterr().err
 
 
 def test_a_motion_without_torques_plays_and_marks_where_it_uses_the_most_of_limits(folder):

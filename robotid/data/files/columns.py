@@ -28,7 +28,7 @@ _QUANTITIES = {
     "current": ("current", "currents", "curr", "i"),
 }
 _COMMANDED = ("ref", "reference", "des", "desired", "cmd", "command", "commanded", "target",
-              "goal", "setpoint")  # fmt: skip
+              "goal", "setpoint", "action")  # fmt: skip
 _REFERENCES = {"q": "qref", "dq": "dqref", "tau": "tauref"}
 #: Kinds of columns of a joint or, with "m", of a motor.
 KINDS = tuple(f"{kind}{m}" for m in ("", "m") for kind in (*_QUANTITIES, *_REFERENCES.values()))
@@ -40,7 +40,7 @@ _KIND_OF |= {
     if kind in _REFERENCES
 } | {f"{kind}m": f"{kind}m" for kind in KINDS}
 _NO_MEANING = {"measured", "meas", "actual", "act", "state", "states", "field", "data", "joint",
-               "joints", "rad", "deg", "nm"}  # fmt: skip
+               "joints", "observation", "rad", "deg", "nm"}  # fmt: skip
 _CLOCKS = {("time",), ("t",), ("timestamp",), ("stamp",), ("header", "stamp")}
 _NAME = re.compile(r"(.*?)name(\W*\d+\W*)")  # of a joint, in each row: field.name0
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+|[^\W\d_]+")

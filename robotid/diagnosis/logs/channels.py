@@ -463,7 +463,8 @@ def _clipping(log: Log) -> Iterator[Finding]:
                 near = sum(int(own[i:k, j].sum()) for i, k in runs)
                 along = np.sum(sign * travel[:, j] > least[:, 0])
                 is_flat = MOST * near < at.sum() < MOST * along  # else a maximum, or friction
-                if is_flat and 4 * band < np.median(depth):
+                is_largest = np.ptp(smooth[:, j]) <= 2 * np.max(sign * smooth[:, j]) + 4 * band
+                if is_flat and is_largest and 4 * band < np.median(depth):
                     limit = float(np.median(x[at]))
                     rows = np.sum((np.abs(x - limit) <= BEYOND_NOISE * noise[j]) & moving)
             if rows >= fewest and not np.ptp(x) < units.COARSE * units.quantum(x):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from robotid.base.findings import Finding, listed
-from robotid.base.tolerances import REMAINDER, SLACK, TINY
+from robotid.base.tolerances import REMAINDER, SLACK
 from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import AGREES, DIFFERS
@@ -16,7 +16,7 @@ from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.robot.bodies import body_points, kinematic_lengths, link_places
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
-from robotid.robot.prior import FARTHEST, REASONS, THIN, assumed_masses
+from robotid.robot.prior import FARTHEST, REASONS, assumed_masses, body_sizes
 from robotid.robot.tree import Inertial, Tree, exact_angle, numbers
 
 #: Findings that take the URDF's masses as evidence.
@@ -25,6 +25,7 @@ _OF_MASSES = (
 )  # fmt: skip
 DENSEST = 12_000.0  # [kg/m^3] of a link: lead has 11,340
 _LIGHTEST = 10.0  # [kg/m^3] over the box: foam
+_THIN = 0.01  # [m] least side of a box: thin sheets have a volume
 _LONGEST = np.sqrt(5.0)  # ellipsoid of a body with its mass on two sides, over the box
 _SLENDER = 1.6  # ellipsoid over the length that the kinematics give; a uniform rod has 1.29
 _SMALL = 1e-3  # share of the robot's mass below which a fault of a body is only a note
@@ -59,8 +60,7 @@ def assumed_inertials(model: RobotModel) -> list[Finding]:
 
 def _far_origins(model: RobotModel) -> Iterator[Finding]:
     """Yield an error if joints are far beyond the bodies that carry them, as in millimetres."""
-    J = pseudo_inertia(model.standard_parameters()[: model.layout.n_inertial])
-    size = np.sqrt(np.trace(J[:, :3, :3], axis1=1, axis2=2) / np.maximum(J[:, 3, 3], TINY))  # RMS
+    size = body_sizes(pseudo_inertia(model.standard_parameters()[: model.layout.n_inertial]))
     engine = model.pin_model
     for joint, i, place in zip(engine.names, engine.parents, engine.jointPlacements, strict=True):
         distance = float(np.linalg.norm(place.translation))
@@ -208,7 +208,7 @@ def _against_geometry(body: str, J: Array, points: Array) -> Iterator[Finding]:
     """Yield the parameters of a body that are impossible in the box around its geometry."""
     of_link, mass = {"subject": f"link {body}", "link": body}, float(J[3, 3])
     low, high = points.min(axis=0), points.max(axis=0)
-    sides = np.maximum(high - low, THIN)
+    sides = np.maximum(high - low, _THIN)
     diagonal = float(np.linalg.norm(sides))
     centre = J[:3, 3] / mass
     outside = float(np.linalg.norm(np.maximum(np.maximum(low - centre, centre - high), 0.0)))
@@ -226,7 +226,7 @@ def _against_geometry(body: str, J: Array, points: Array) -> Iterator[Finding]:
     second = np.trace(J[:3, :3]) / mass - float(centre @ centre)  # mean square distance
     farthest = float(np.max(np.sum((points - centre) ** 2, axis=1))) ** 0.5
     gyration = max(float(second), 0.0) ** 0.5
-    if gyration > farthest + 0.5 * THIN:
+    if gyration > farthest + 0.5 * _THIN:
         yield finding("gyration", **of_link, gyration=gyration, farthest=farthest)
         return
     variance = np.maximum(np.diag(J)[:3] / mass - centre**2, 0.0)  # (3,), of the mass [m^2]

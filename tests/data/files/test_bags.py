@@ -97,7 +97,7 @@ def test_other_messages_are_passed_over_and_values_are_checked_as_in_any_log(tmp
     assert_same(back, log)
     assert back.notes == ("columns ignored: position_finger",)
     bare = [(*message[:4], []) for message in messages_of(log)]
-    with pytest.raises(DataError, match="no columns 'tau_shoulder', 'tau_elbow'; torque or curr"):
+    with pytest.raises(DataError, match="no columns 'tau_shoulder', 'tau_elbow'; no torque or c"):
         read_log(write_mcap(tmp_path / "bare.mcap", bare), JOINTS)
     path = write_mcap(tmp_path / "deg.mcap", messages_of(replace(log, q=20 * log.q)))
     with pytest.raises(DataError, match=r"^deg.mcap: .* looks like degrees"):

@@ -70,13 +70,12 @@ SPELLINGS = [
     ("/joint_states/{}/position", "/joint_states/{}/vel", "/joint_states/{}/torque", "command/{}"),
     ("Q [rad] {}", "QD-{}", "TAU ({}) [Nm]", "q_ref {}"),
     ("actual_q_{}", "actual_qd_{}", "measured_torque_{}", "{}_desired_position"),
+    ("observation.state.{}.pos", "observation.{}.vel", "observation.{}.torque", "action.{}.pos"),
 ]
+CLOCKS = ["timestamp", "t", "stamp", "%time", "Time", "header.stamp", "time"]
 
 
-@pytest.mark.parametrize(
-    ("words", "clock"),
-    list(zip(SPELLINGS, ["timestamp", "t", "stamp", "%time", "Time", "header.stamp"], strict=True)),
-)
+@pytest.mark.parametrize(("words", "clock"), list(zip(SPELLINGS, CLOCKS, strict=True)))
 def test_words_of_a_quantity_stand_before_or_after_the_joint(words, clock):
     joints = ("pan", "wrist_1")
     names = [word.format(joint) for joint in joints for word in words]

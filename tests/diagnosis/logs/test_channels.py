@@ -262,11 +262,10 @@ def test_a_held_torque_is_late_by_half_of_what_it_is_held_less_a_row(rows):
 
 
 def test_a_torque_is_clipped_at_either_limit_and_held_by_groups():
-    t = 3.0 + np.arange(2000) / 100
-    q = np.column_stack([np.sin(2 * t), np.cos(t), np.sin(t), np.cos(3 * t)])
-    tau = 5.0 * q
-    tau[:, 0] = np.clip(tau[:, 0], -4.0, 3.0)
     k = np.arange(2000)
+    t = 3.0 + k / 100
+    q = np.column_stack([np.sin(2 * t), np.cos(t), np.sin(t), np.cos(3 * t)])
+    tau = 5.0 * np.column_stack([np.clip(q[:, 0], -0.8, 0.6), q[:, 1:]])
     tau[:, 1], tau[:, 2], tau[:, 3] = tau[k // 4 * 4, 1], tau[k // 7 * 7, 2], tau[k // 4 * 4, 3]
     log = replace(log_of(), joints=tuple("abcd"), q=q, tau=tau)
     found = list(check_torque_channels(log))
@@ -295,6 +294,8 @@ def test_a_torque_that_is_clipped_under_noise_is_named_and_no_other(noise, least
             assert (finding.code, share < 1.0) == ("clipped", True)
             assert abs(finding.evidence["limit"]) == pytest.approx(limit[j], abs=2 * level[j])
             named += 1
+        one = np.maximum(log.tau, -0.3 * limit) + level * rng.standard_normal(log.tau.shape)
+        assert list(check_torque_channels(replace(log, tau=one))) == []  # no limit is of one side
     assert named >= least
 
 

@@ -309,7 +309,7 @@ def test_a_cutoff_is_advised_above_which_the_torque_lacks_what_is_predicted(rng)
     np.testing.assert_allclose(share, [0.3**2 / (0.2**2 + 0.3**2), 0, 0, 0], atol=0.01)
     filtered = replace(torque(r[:, 0], slow, slow, slow), beyond=share[0], frequency=frequency)
     assert f"and 69 % of its power is above {frequency:.2g} Hz" in filtered.sentence
-    assert f"Lower the cutoff in [signals], as far as {frequency:.2g} Hz" in filtered.sentence
+    assert f"Lower the cutoff in [signals], down to {frequency:.2g} Hz" in filtered.sentence
     assert "cutoff in" not in replace(filtered, beyond=0.2).sentence
 
 

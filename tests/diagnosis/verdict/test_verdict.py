@@ -159,8 +159,7 @@ def test_an_impossible_body_makes_the_result_usable_and_no_joint(code):
 )
 def test_each_threshold_lies_where_it_is_stated(error, fitted, status):
     found = verdict({"a": joint(error)}, fitted={"a": joint(fitted)})
-    assert found.status == status
-    assert found.joints["a"].status == status
+    assert (found.status, found.joints["a"].status) == (status, status)
 
 
 @pytest.mark.parametrize(

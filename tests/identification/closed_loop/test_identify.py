@@ -278,7 +278,7 @@ def test_a_log_with_other_gains_is_named_with_their_ratio(found, other_log):
         named += [one for one in findings if one.code == "other_gains"]
     assert [one.joints for one in named] == [(joint,) for joint in other_log.joints[1:]] * 2
     for one in named:
-        entry = tomllib.loads(one.message.partition("of the job: ")[2])["controller"]
+        entry = tomllib.loads(one.message.partition("in the job file: ")[2])["controller"]
         gains = LogGains.from_dict(entry).factors(found.loop, other_log.joints)
         np.testing.assert_allclose(gains, RATIOS, rtol=0.15)
         assert one.evidence["after"] < 0.3 * one.evidence["before"]
