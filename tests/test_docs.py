@@ -235,7 +235,7 @@ def test_from_excitation_to_a_result(follow):
 
 
 def test_a_payload_of_two_logs(follow):
-    printed = follow("tutorials/payload.md")
+    printed = follow("tutorials/payload.md", "--seconds 60")
     found = re.search(r"mass (\S+) kg \(95 % interval (\S+) to ([^)]+)\)", printed).groups()
     mass, low, high = map(float, found)
     assert 1.98 < low < mass < high < 2.02

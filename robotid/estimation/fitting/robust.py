@@ -116,7 +116,8 @@ def find_outliers(
         reverses = (np.abs(motion.v) <= near * np.abs(motion.a)) | _is_reversed(motion, near)
         excess = error - np.where(reverses, step, 0.0)
         rms = np.sqrt(np.mean(motion.tau**2, axis=0))
-        sizes = np.where(excess >= _MATTERS * rms, excess / _scales([error], [mask]), 0.0)
+        matters = (excess >= _MATTERS * rms) & (rms > 0.0)  # a passive joint has no torque
+        sizes = np.where(matters, excess / _scales([error], [mask]), 0.0)
         log = Path(e.recording.log.path).name or "log"
         for j, joint in enumerate(model.row_names):
             rows = np.flatnonzero((sizes[:, j] >= _OUTLIER) & mask[:, j])
