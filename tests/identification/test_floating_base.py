@@ -18,6 +18,8 @@ from robotid.estimation.estimators import WLS
 from robotid.estimation.fitting.fitted import next_errors
 from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.identification.repeated_errors import with_repeated_errors
+from robotid.output.files.entries import build_result
+from robotid.output.files.result_file import stated_covariance
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -77,6 +79,9 @@ def test_the_expected_errors_are_those_of_unseen_steps(found):
     ratio = next_errors(found[0]) / measured
     np.testing.assert_allclose(ratio[6:], 1.0, atol=0.15)
     np.testing.assert_allclose(ratio[:6], 1.0, atol=0.6)  # few rows of the base are determined
+    C = stated_covariance(build_result(found[0], {}), found[0].model.layout.names)
+    whole, repeated = found[0].standard_covariance, found[0].repeated
+    np.testing.assert_allclose(C, whole - repeated, atol=0.05 * np.abs(repeated).max())
 
 
 def test_the_bodies_of_another_simulator_are_found(found):
