@@ -176,7 +176,8 @@ def test_of_families_alike_the_better_conditioned_is_chosen(plain, rising):
     assert abs(shares[0] - shares[1]) < 0.02
     assert last["stribeck"].p_value < 0.015
     assert not any(shape.is_at_bound for shape in choice.shapes)
-    stated = helper.found_in(plain, rising_logs(rising), friction={ELBOW: "stribeck", "*": "none"})
+    logs = [evaluation.recording.log for evaluation in rising.fitted]
+    stated = helper.found_in(plain, logs, friction={ELBOW: "stribeck", "*": "none"})
     (other,) = (c for c in stated.drives if c.families)
     assert other.shapes[0].is_at_bound
     (said,) = [f for f in stated.findings if f.code == "correlated_terms"]
@@ -189,10 +190,6 @@ def test_of_families_alike_the_better_conditioned_is_chosen(plain, rising):
     names, C = stated.model.layout.names, stated.standard_covariance
     i, k = (names.index(f"{ELBOW}.{term}") for term in ("coulomb", "stribeck"))
     assert said.evidence["r"] == pytest.approx(C[i, k] / np.sqrt(C[i, i] * C[k, k]))
-
-
-def rising_logs(found):
-    return [evaluation.recording.log for evaluation in found.fitted]
 
 
 def test_harmonics_are_for_joints_that_turn_far_enough(plain):

@@ -64,10 +64,6 @@ def misfits(found):
     return find_misfits(take_sample(found))
 
 
-def findings_of(found):
-    return [misfit_finding(misfit, found, found.on_misfit) for misfit in found.misfits]
-
-
 @pytest.fixture(scope="module")
 def three(ur5):
     """The first three joints of a UR5."""
@@ -152,7 +148,8 @@ def test_coulomb_friction_that_was_left_out_is_asked_for(three):
     terms = ("armature", "viscous", "offset")
     model = RobotModel.from_urdf(three.tree, joints=three.joints, terms=terms)
     logs = [log_with(three, 1, part=k) for k in (0, 1)]
-    found = findings_of(concluded(model, logs))
+    fit_of = concluded(model, logs)
+    found = [misfit_finding(misfit, fit_of, fit_of.on_misfit) for misfit in fit_of.misfits]
     loud = {finding.where for finding in found if finding.severity == "warning"}
     assert loud == set(three.joints)
     for finding in found:

@@ -151,8 +151,10 @@ def test_a_fault_of_the_file_is_named(tmp_path, old, new, code, where, severity,
 
 
 def test_point_masses_are_no_lengths_in_another_unit(tmp_path):
-    text = CLEAN.replace("0.2 0 0", "0.4 0 0").replace("0.1 0 0", "0 0 0")
-    (tmp_path / "points.urdf").write_text(re.sub('(i..)="0.[0-9]+"', r'\1="1e-6"', text))
+    text = re.sub('(i..)="0.[0-9]+"', r'\1="1e-6"', CLEAN)
+    for old, new in (("0.2 0", "0.4 0"), ("0.1 0", "0 0"), ('"2"', '"0.01"'), ("0.5 0", "0.9 0")):
+        text = text.replace(old, new)
+    (tmp_path / "points.urdf").write_text(text)
     assert {x.code for x in inspect_urdf(tmp_path / "points.urdf").findings} == {"default_inertial"}
 
 
