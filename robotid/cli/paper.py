@@ -32,10 +32,8 @@ def _show(result: dict[str, Any]) -> None:
     for name, model in result["models"].items():
         errors = model["relative_error"]
         ends = [result[case][name]["relative_error"][-1] for case in cases]
-        cells = [errors[0], errors[1], errors[-1], *ends]
-        print(
-            f"  {name:10}" + "".join(f"{cell:9.2g}" for cell in cells) + f"   {model['NA'] or '-'}"
-        )
+        cells = "".join(f"{x:9.2g}" for x in (errors[0], errors[1], errors[-1], *ends))
+        print(f"  {name:10}{cells}   {model['NA'] or '-'}")
     print("\nrandom motions that converged to 1e-3")
     for name, motions in result["trajectories"].items():
         print(f"  {name:10} {motions['converged']} of {motions['runs']}")

@@ -192,7 +192,7 @@ class Fit(Identified, Solution):
     factors: Factors  # triangular factors of the fitted rows, base parameters
     determination: Determination  # which base parameters the fitted rows determine
     open_terms: tuple[OpenTerm, ...] = ()  # uncertain terms, in the covariance
-    repeated: Array | float = 0.0  # (p, p), covariance due to errors that torques repeat
+    repeated: Array | float = 0.0  # (p, p), covariance due to errors that the residual has
     regressor_noise: RegressorNoise | None = None  # of position quantisation; or negligible
     runs: tuple[RunsOf, ...] = ()  # information of three or more logs on varying parameters
     sums: RunSums | None = None  # sums over their rows from which it is computed

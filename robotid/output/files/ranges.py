@@ -282,12 +282,9 @@ def sample(result: Result, count: int, rng: np.random.Generator) -> tuple[list[s
     def is_possible(x: Array) -> Array:
         drawn = nominal + x
         signs = (drawn[:, is_bounded] >= 0.0).all(1) & (drawn[:, is_positive] > 0.0).all(1)
-        bodies = (drawn[:, : model.layout.n_inertial] - held).ravel()
-        J = np.moveaxis(pseudo_inertia(bodies), 0, 2)  # (4, 4, bodies of all draws)
-        while len(J) > 1:  # the last pivot of an elimination is NaN if one before is not positive
-            pivot = np.where(J[0, 0] > 0.0, J[0, 0], np.nan)
-            J = J[1:, 1:] - J[1:, :1] * (J[:1, 1:] / pivot)
-        return np.asarray(signs & (J[0, 0] > 0.0).reshape(len(x), -1).all(1))
+        J = pseudo_inertia((drawn[:, : model.layout.n_inertial] - held).reshape(-1))
+        minors = [np.linalg.det(J[:, :k, :k]) > 0.0 for k in (1, 2, 3, 4)]  # Sylvester
+        return np.asarray(signs & np.all(minors, axis=0).reshape(len(x), -1).all(1))
 
     x = possible_draws(root, is_possible, count, rng)
     drawn = nominal + x

@@ -78,9 +78,14 @@ class Section(NamedTuple):
     is_open: bool | None = None  # whether it is open initially; None if it cannot be folded
 
 
+def raised(words: str) -> str:
+    """Return words with the exponents of their units raised."""
+    return re.sub(r"(?<=[a-z])\^[23]", lambda power: "²" if power[0] == "^2" else "³", words)
+
+
 def text(value: str, *, flag: bool = False) -> Cell:
     """Return a cell of text."""
-    return Cell(escape(value), " ".join(["flag"] * flag + ["text"] * (len(value) < 24)))
+    return Cell(escape(raised(value)), " ".join(["flag"] * flag + ["text"] * (len(value) < 24)))
 
 
 def code(value: str) -> Cell:
@@ -167,7 +172,7 @@ def table(
     head = ""
     for title, cell in zip(headers, first, strict=True):
         kind = "number" if cell.kind == "number" else "text"
-        head += f'<th scope="col" class="{kind}">{escape(title)}</th>'
+        head += f'<th scope="col" class="{kind}">{escape(raised(title))}</th>'
     body = "".join(_row(row, is_data=is_data) for row in rows)
     last = f"<tfoot>{_row(foot)}</tfoot>" if foot else ""
     title, data = escape(caption), ' class="data"' if is_data else ""
@@ -227,7 +232,6 @@ def page(title: str, header: str, sections: Mapping[str, tuple[Any, ...]]) -> st
     shown = {key: Section(*section) for key, section in sections.items()}
     links = "".join(f'<a href="#{key}">{x.title}</a> ' for key, x in shown.items())
     body = "".join(_section(key, section) for key, section in shown.items())
-    body = body.replace("m^2", "m²").replace("s^2", "s²")  # units in tables and charts
     named = [name for name, mark in _SCRIPTS.items() if re.search(mark, header + body)]
     has_dock = _DOCK in body
     style = asset("page.css") + (asset("dock.css") if has_dock else "")
@@ -360,7 +364,8 @@ def chart_html(chart: Chart, caption: str, *, points: int = POINTS) -> str:
          "half": None if half is None else stepped(half[rows])}
         for s, y, half in lines
     ]  # fmt: skip
-    data = {**vars(chart), "x": _axis(x[rows], chart, "x", "<u4"), "series": series}
+    labels = {"x_label": raised(chart.x_label), "y_label": raised(chart.y_label)}
+    data = {**vars(chart), **labels, "x": _axis(x[rows], chart, "x", "<u4"), "series": series}
     text = script_json(data)
     head = f"<figcaption>{caption}</figcaption>" if caption else ""
     return (

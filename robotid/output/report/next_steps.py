@@ -310,7 +310,7 @@ def _watch(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause])
     rows = found.metrics().per_joint
     where, advice = _named(causes, found.model.joints), dict[str, list[str]]()
     named = dict.fromkeys(joint for cause in causes for joint in cause.joints)
-    for joint in filter(rows.__contains__, named):
+    for joint in (joint for joint in named if joint in rows):
         advice.setdefault(found.residual_cause(joint)[1], []).append(joint)
     of = {text: f"{listed(joints)}: " for text, joints in advice.items() if len(advice) > 1}
     why = "".join(f" {of.get(text, '')}{text}." for text in advice if text)

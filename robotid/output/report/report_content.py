@@ -442,9 +442,8 @@ def _chains(settings: Iterable[SignalSettings]) -> str:
         order = f"order {x.order} run forward and backward"
         low_pass = f"zero-phase Butterworth low-pass, cut-off {x.cutoff or 0:g} Hz, {order}"
         rate = f"grid of {round(x.rate, 1):g} Hz" if x.rate else "samples as recorded"
-        rates.setdefault(f"{low_pass if x.cutoff else 'no filter'}, velocity {x.velocity}", {})[
-            rate
-        ] = None
+        chain = f"{low_pass if x.cutoff else 'no filter'}, velocity {x.velocity}"
+        rates.setdefault(chain, {})[rate] = None
     return "; or ".join(f"{chain}, {' or '.join(same)}" for chain, same in rates.items())
 
 

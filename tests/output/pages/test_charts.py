@@ -318,6 +318,7 @@ def test_a_small_error_of_a_plain_number_is_written_in_full():
 def test_a_cell_has_the_style_of_its_content_and_its_number_in_full():
     for cell, wanted in (
         (text("<" * 23), ("&lt;" * 23, "text", None)), (text("a" * 24), ("a" * 24, "", None)),
+        (text("s^3/m^2"), ("s³/m²", "text", None)), (code("m^2.csv"), ("m^2.csv", "code", None)),
         (text("a", flag=True), ("a", "flag text", None)),
         (code("a.b_c/<" + 10 * "d"), ("a.<wbr>b_<wbr>c/<wbr>&lt;dddddddddd", "code", None)),
         (code("wrist_1_joint/<_"), ("wrist_1_joint/&lt;_", "code", None)),
