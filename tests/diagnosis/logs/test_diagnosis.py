@@ -153,6 +153,14 @@ def recorded(model, change=lambda robot: None, gravity=1.0, inertia=1.0, gain=(1
     return Log(t=t, q=q, tau=np.asarray(gain) * tau, joints=model.joints, path="run.csv")
 
 
+def uneven(robot):
+    """Move the centres of mass by a fifth of the radius of gyration."""
+    rng = np.random.default_rng(1)
+    for body in robot.inertias.tolist()[1:]:
+        radius = np.sqrt(np.trace(body.inertia) / body.mass)
+        body.lever += 0.3 * radius * rng.uniform(-1.0, 1.0, 3)
+
+
 def hung(robot):
     robot.gravity.linear = 9.81 * np.array([0.0, np.sin(0.35), -np.cos(0.35)])
 
@@ -161,6 +169,7 @@ SHIFT = np.pi / 2 * np.array([0.0, 1.0, 0.0, 0.0, 1.0, 0.0])
 QUARTER = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 READ = {
     "as it is": (lambda m: (m, recorded(m)), {}),
+    "other centres of mass": (lambda m: (m, recorded(m, uneven)), {}),
     "clock": (lambda m: (m, (x := recorded(m), replace(x, t=2 * x.t))[1]), {"time_scale": ()}),
     "slow": (lambda m: (m, (x := recorded(m), replace(x, t=1.25 * x.t))[1]), {"time_scale": ()}),
     "two zeros": (lambda m: (m, (x := recorded(m), replace(x, q=x.q + SHIFT))[1]), {
@@ -245,6 +254,15 @@ def test_a_recording_that_is_fitted_twice_is_named(ur5, short):
     (found,) = [f for f in findings if f.code == "repeated_log"]
     assert (found.where, found.severity) == ("again.csv", "warning")
     assert f"the same recording as {short.name}" in found.message
+
+
+def test_rows_that_are_stamped_on_arrival_have_no_other_fault(ur5, short):
+    k = np.arange(len(short.t))
+    t = short.t[np.minimum(k // 8 * 8 + 7, len(k) - 1)] + 1e-5 * (k % 8)
+    found = diagnose(ur5, [replace(short, t=t)], [], SIGNALS)
+    assert {f.code: f.severity for f in found if f.severity != "note"} == {
+        "bunched_stamps": "error"
+    }
 
 
 def test_an_origin_in_millimetres_is_the_only_cause(short, tmp_path):
