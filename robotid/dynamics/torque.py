@@ -27,12 +27,12 @@ from robotid.dynamics.rows import (
     drive_motion,
     drive_values,
     friction_directions,
-    inertial_rows,
     kept_rows,
     remembered,
     trajectory_rows,
     trajectory_values,
     work_per_sample,
+    write_inertial,
 )
 from robotid.robot.closure import Chains
 from robotid.robot.drive_term import DriveMotion
@@ -52,6 +52,7 @@ def joint_torque_regressor(
     a: Array,
     direction: Array | None = None,
     memory: Array | None = None,
+    data: pin.Data | None = None,
 ) -> Array:
     """Return the regressor Y with tau = Y pi at each of N samples, shape (N n_rows, p).
 
@@ -67,7 +68,7 @@ def joint_torque_regressor(
             row = model.row_names[j]
             raise DataError(f"{name}[{k}] of {row} is {values[k, j]}, expected a finite number")
     Y = np.zeros((len(q), model.n_rows, len(model.layout.names)))
-    inertial_rows(model, q, v, a).write(slice(None), Y)
+    write_inertial(model, q, v, a, Y, data)
     _write_drives(model, (q, v, a), direction, memory, Y)
     return Y.reshape(len(q) * model.n_rows, -1)
 
@@ -79,7 +80,7 @@ def trajectory_regressor(
     m = trajectory if samples is None else trajectory.at(samples)
     Y = np.zeros((len(m.t), model.n_rows, len(model.layout.names)))
     if (stored := kept_rows(model, trajectory)) is None:
-        inertial_rows(model, m.q, m.v, m.a).write(slice(None), Y)
+        write_inertial(model, m.q, m.v, m.a, Y)
     else:
         stored.write(slice(None) if samples is None else samples, Y)
     _write_drives(model, (m.q, m.v, m.a), m.direction, m.memory, Y)
@@ -151,11 +152,11 @@ def build_problem(
     length = max(1, min(BLOCK, BLOCK_SIZE // (model.n_rows * len(model.layout.names))))
 
     def stream() -> Iterator[Block]:
-        m = trajectory
+        m, data = trajectory, model.pin_model.createData()
         for start in range(0, samples, length):
             part = slice(start, start + length)
             known = (None if x is None else x[part] for x in (m.direction, m.memory))
-            W = joint_torque_regressor(model, m.q[part], m.v[part], m.a[part], *known)
+            W = joint_torque_regressor(model, m.q[part], m.v[part], m.a[part], *known, data)
             if m.basis is not None:
                 Y = W.reshape(-1, model.n_rows, W.shape[1])
                 W = without_forces(m.basis[part], Y).reshape(W.shape)
