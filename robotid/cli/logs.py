@@ -75,7 +75,7 @@ def survey_logs(
     surveyed = tuple(survey(entries) for entries in groups)
     if faults and refused is None:
         errors = [error for _, error in _by_fault(faults)]
-        raise DataError(". Also, ".join(map(str, errors)), errors[0].code)
+        raise DataError("\n".join(map(str, errors)), errors[0].code)
     return surveyed
 
 
@@ -87,9 +87,9 @@ def _by_fault(refused: Refused) -> list[tuple[str, DataError]]:
         faults.setdefault(fault, {}).setdefault(entry.path.name, error)
     errors = []
     for logs in faults.values():
-        (_, first), *others = logs.items()
-        same = f". The same fault ({first.code}) is in {listed(name for name, _ in others)}"
-        errors.append((listed(logs), DataError(f"{first}{same if others else ''}", first.code)))
+        first, *others = logs.values()
+        same = f"{listed(logs)} have the same fault ({first.code}). " if others else ""
+        errors.append((listed(logs), DataError(f"{same}{first}", first.code)))
     return errors
 
 

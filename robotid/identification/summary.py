@@ -118,15 +118,15 @@ def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
     if list(by_cell) == ["good"]:
         by_cell = {} if verdict["status"] == "good" else {"good": ["every joint"]}
     cells = {words: f"  {', '.join(names)}: {words}" for words, names in by_cell.items()}
-    of_joints = {
-        joint["reasons"][0]: verdict_cell(name, joint)
-        for name, joint in verdict["per_joint"].items()
-        if joint["reasons"]
-    }
-    lines = [
-        cells.get(of_joints[reason], "") if reason in of_joints else f"  - {reason}"
-        for reason in verdict["reasons"]
-    ]
+    firsts = {x: joint_reason(x, joint["reasons"]) for x, joint in verdict["per_joint"].items()}
+    lines = []
+    for reason in verdict["reasons"]:
+        about, _, words = reason.partition(": ")
+        named = set(about.split(", ")) & firsts.keys()
+        same = [joint for joint in firsts if firsts[joint] == (words if named else reason)]
+        is_first = bool(same) and named <= set(same)
+        of_joint = verdict_cell(same[0], verdict["per_joint"][same[0]]) if is_first else ""
+        lines.append(cells.get(of_joint, "") if is_first else f"  - {reason}")
     in_order = dict.fromkeys([*filter(None, lines), *cells.values()])
     uses = uses_line(verdict.get("use_for", {}))
     return [f"verdict: {verdict['status']}", *in_order, *([uses] if uses else [])]
@@ -135,6 +135,8 @@ def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
 def verdict_cell(joint: str, verdict: Mapping[str, Any]) -> str:
     """Return the verdict on a joint with its first reason, as in "usable, error 20 % on b.csv"."""
     status, why = verdict["status"], joint_reason(joint, verdict["reasons"])
+    if why.endswith(status):
+        return why
     return str(status) if status == "good" or not why else f"{status}, {why}"
 
 
