@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 import pytest
@@ -107,6 +108,16 @@ def test_designs_are_the_same_under_a_seed_and_stop_when_told(designer):
     np.testing.assert_array_equal(one.motion.coefficients, other.motion.coefficients)
     assert not one.is_converged
     assert one.used.max() <= 1.0
+
+
+def test_more_time_gives_no_worse_design_and_it_is_on_the_finer_grid(designer, monkeypatch):
+    short = replace(designer, basis=FourierBasis(4.0, 2))
+    calls = count(step=1.0)  # a clock of calls, the same on every machine
+    monkeypatch.setattr("time.monotonic", lambda: next(calls))
+    few, many = (short.design(np.random.default_rng(3), starts=99, seconds=s) for s in (150, 600))
+    assert many.starts > few.starts
+    assert many.is_converged
+    assert many.objective <= few.objective
 
 
 def test_a_search_near_the_limits_continues_beyond_them_and_a_stalled_one_restarts(designer, rng):

@@ -171,7 +171,7 @@ def test_a_reason_of_a_joint_is_shown_once():
             "b": {"status": "good", "reasons": ["error 3 %"]},
             "c": {"status": "usable", "reasons": ["c: slow"]},
             "d": {"status": "good", "reasons": ["error 4 %"]},
-            **dict.fromkeys("ef", {"status": "poor", "reasons": ["e, f: cold"]}),
+            **{name: {"status": "poor", "reasons": ["e, f: cold"]} for name in "ef"},
         },
     }
     assert verdict_lines(verdict) == [

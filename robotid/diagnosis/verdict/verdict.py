@@ -412,8 +412,8 @@ def concluded(
     """Return the verdict that follows from reasons; the same words about joints are one reason."""
     status = "usable" if warnings else "good"
     status = "poor" if poor or log_errors else status if is_tested else "not evaluated"
-    parts = [(x, *x.partition(": ")) for x in (*log_errors, *poor, *warnings)]
-    reasons = _shared((joint, words) if joint in joints else ("", x) for x, joint, _, words in parts)
+    parts = [(*x.partition(": "), x) for x in (*log_errors, *poor, *warnings)]
+    reasons = _shared((name, words) if name in joints else ("", x) for name, _, words, x in parts)
     return Verdict(status, (*(reasons or [good]), *notes), joints, tuple(log_errors))
 
 
