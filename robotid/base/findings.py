@@ -6,7 +6,6 @@ import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain
 from string import Formatter
 from typing import Any
 
@@ -137,9 +136,9 @@ def _filled(values: Sequence[str | float], spec: str, how: str) -> str:
     """Return names with commas, or the range of numbers, or one of them."""
     numbers = sorted(value for value in values if not isinstance(value, str))
     if not numbers:
-        each = dict.fromkeys(map(str, values))  # lists of names, of which each is given once
-        split = each if len(each) < 2 else dict.fromkeys(chain(*(x.split(", ") for x in each)))
-        names = [f"'{x}'" if how == "q" else x for x in split]
+        each = dict.fromkeys(map(str, values))  # names, or lists of names: each is given once
+        each = each if len(each) < 2 else dict.fromkeys(", ".join(each).split(", "))
+        names = [f"'{x}'" if how == "q" else x for x in each]
         return (" " if names[0].startswith("--") else ", ").join(names)
     bare = spec.removesuffix("~")
     unit = next((unit for unit in _FACTORS if bare.endswith(unit)), "")

@@ -1,6 +1,6 @@
 """The logs of a job: opened once, examined, and identified by their inputs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import chain
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 _PIECES = 8  # pieces per rows in memory: the filter of a piece needs memory of its own
 _SHORTEST = 256  # rows of a piece
-
 
 #: Logs that cannot be read, and why.
 Refused: TypeAlias = list[tuple[LogEntry, DataError]]
@@ -79,18 +78,16 @@ def survey_logs(
     return surveyed
 
 
-def _by_fault(refused: Refused) -> list[tuple[str, DataError]]:
-    """Return the logs with each fault, and its error in the first of them, which names all."""
+def _by_fault(refused: Refused) -> Iterator[tuple[str, DataError]]:
+    """Yield the logs with each fault, and its error in the first of them, which names all."""
     faults: dict[str, dict[str, DataError]] = {}
     for entry, error in refused:
         fault = str(error) if error.code == "unusable_log" else error.code  # the code of any other
         faults.setdefault(fault, {}).setdefault(entry.path.name, error)
-    errors = []
     for logs in faults.values():
         first, *others = logs.values()
         same = f"{listed(logs)} have the same fault ({first.code}). " if others else ""
-        errors.append((listed(logs), DataError(f"{same}{first}", first.code)))
-    return errors
+        yield listed(logs), DataError(f"{same}{first}", first.code)
 
 
 def units_of_logs(entries: Sequence[LogEntry]) -> list[str]:

@@ -68,13 +68,10 @@ _RATE = 100.0  # [Hz] of the samples at which limits are checked
 
 @dataclass(frozen=True)
 class FourierBasis:
-    """Sines and cosines of the first harmonics of 1 / duration, at rest at both ends.
+    """Sines and cosines of the first harmonics of 1 / duration (Swevers 1997), at rest at the ends.
 
     The first function is constant 1. Two of the 2 h coefficients of a joint are fixed by the ends:
     sum k s_k = 0 makes its velocity 0 there, and sum k^2 c_k = 0 its acceleration.
-
-    References:
-        Swevers et al. (1997), Optimal robot excitation and identification.
     """
 
     duration: float  # [s]
@@ -256,11 +253,10 @@ class Designer:
         progress: Callable[[int, float], None] | None = None,
     ) -> Design:
         """Return the best motion, checked on a grid 15 times as fine as the first one."""
-        began, best, coarse = time.monotonic(), np.inf, np.inf  # criteria: shown, of the starts
+        began, best = time.monotonic(), np.inf
         followed: list[State] = []
         designs: list[Design] = []
-        fine = replace(self, finer=_POLISHED * self.finer)
-        finest = replace(self, finer=_FINER * self.finer)
+        fine, finest = (replace(self, finer=k * self.finer) for k in (_POLISHED, _FINER))
 
         def is_over() -> bool:
             return best < np.inf and time.monotonic() - began > seconds
@@ -287,10 +283,10 @@ class Designer:
             followed.append(
                 follow(self, State(random[k], objective, random[k], multipliers), _NEARLY)
             )
-            # with limited time each better start: the coarse grid may not show which is best
-            is_better = followed[-1].objective < coarse - _NEARLY
+            before = min((state.objective for state in followed[:-1]), default=np.inf)
+            is_better = followed[-1].objective < before - _NEARLY
+            # with limited time each better start is polished: more time gives no worse motion
             if seconds < np.inf and is_better and not (designs and is_over()):
-                coarse = followed[-1].objective
                 designs.append(polished(followed[-1]))
         if not designs:
             designs.append(polished(min(followed, key=lambda state: state.objective)))

@@ -143,14 +143,11 @@ class Payload:
 
 
 class ChangeDetector:
-    """CUSUM on squared innovations, row by row.
+    """CUSUM on squared innovations, row by row (Page 1954, Continuous Inspection Schemes).
 
     With the squared innovation d_j^2 in units of its variance, the evidence is
     g_j <- max(0, g_j + share (min(d_j^2, 25) - 4)), and a change is flagged when one g_j
     reaches the threshold. The onset of the change is the time at which that g_j last left 0.
-
-    References:
-        Page (1954), Continuous Inspection Schemes.
     """
 
     def __init__(self, n: int, threshold: float) -> None:

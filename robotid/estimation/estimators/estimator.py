@@ -91,9 +91,10 @@ class Estimator(ABC, Generic[DataT]):
     def fit(self, data: DataT) -> Estimate:
         """Estimate the parameters from a problem in base parameters, its factors or a simulator.
 
-        Raises:     DataError: If there are fewer rows than parameters, or a row cannot be used.
-        RankDeficientError: If parameters are not identifiable and there is no prior.
-        NotConvergedError: If an iteration or a solver does not converge.
+        Raises:
+            DataError: If there are fewer rows than parameters, or a row cannot be used.
+            RankDeficientError: If parameters are not identifiable and there is no prior.
+            NotConvergedError: If an iteration or a solver does not converge.
         """
 
 
