@@ -115,11 +115,8 @@ def changed_lines(since: str | None) -> list[tuple[str, int]]:
             file = row.removeprefix("+++ b/")
         elif hunk := re.match(r"@@ -\S+ \+(\d+)(?:,(\d+))? @@", row):
             pairs += [(file, int(hunk[1]) + k) for k in range(int(hunk[2] or 1))]
-    return [
-        (file, k)
-        for file, k in pairs
-        if (ROOT / file).read_text().splitlines()[k - 1][:4] == "    "
-    ]
+    code = {file: (ROOT / file).read_text().splitlines() for file, _ in pairs}
+    return [(file, k) for file, k in pairs if code[file][k - 1].startswith("    ")]
 
 
 def first_in_line(nodes: list, line: int, operator) -> int | None:
