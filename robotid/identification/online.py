@@ -156,8 +156,7 @@ class ChangeDetector:
         self._onset = np.full(n, np.nan)
 
     def push(self, t: float, squares: Array, share: float) -> float | None:
-        """Process one sample; return the onset of a change flagged now [s], else None."""
-        # squares (n,)
+        """Return the onset of a change that the squares (n,) of a sample flag [s], else None."""
         evidence = self.evidence + share * (np.minimum(squares, _LARGEST) - _DRIFT)
         evidence[squares == 0.0] = self.evidence[squares == 0.0]
         starts = (self.evidence <= 0.0) & (evidence > 0.0)
@@ -236,8 +235,7 @@ def payload_of(difference: Array, covariance: Array, columns: Array, spread: Arr
 
 
 def load_spread(spread: Array) -> Array:
-    """Return the prior standard deviations of a payload, (10,): of a mean link, twice its size."""
-    # spread (10 bodies,)
+    """Return prior deviations (10,) of a payload, a mean link of twice its size: spread (10 k,)."""
     by_body = spread.reshape(-1, 10)
     mass = max(float(by_body[:, 0].mean()), float(by_body[-1, 0]))
     radius = 2.0 * float(np.max(by_body[-1, 1:4]) / by_body[-1, 0])

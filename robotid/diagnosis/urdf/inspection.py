@@ -77,7 +77,15 @@ class Inspection:
 
 
 def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
-    """Audit a URDF file, without its meshes; that no model can be built of it is a finding."""
+    """Audit a URDF file.
+
+    Args:
+        path: The URDF file. Meshes are not needed.
+        free_flyer: Whether the base floats.
+
+    Returns:
+        The inspection. A file from which no model can be built gives a finding, not an exception.
+    """
     require_kind(path, (str, Path), "path", "the path of a URDF")
     require_flag(free_flyer, "free_flyer")
     where = f"file {Path(path).name}"

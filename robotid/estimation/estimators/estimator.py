@@ -67,8 +67,7 @@ class Estimate:
     def std_error(self) -> Array:
         """Standard error of each parameter, shape (c,); inf if not identifiable."""
         # noise-free data give a variance of rounding size, of either sign
-        errors: Array = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-        return errors
+        return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
 
     @property
     def quantile(self) -> Array:
