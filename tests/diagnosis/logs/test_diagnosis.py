@@ -10,6 +10,7 @@ import pinocchio as pin
 import pytest
 from helpers.corruptions import CASES, NOISE, ROBOTS, clean_log, controlled_log, robot, table_of
 from helpers.driven import arm
+from helpers.legged import with_other_bodies
 from helpers.synthetic import exact_log, perfect, truth
 
 from robotid.base.findings import Finding, grouped
@@ -153,12 +154,15 @@ def recorded(model, change=lambda robot: None, gravity=1.0, inertia=1.0, gain=(1
     return Log(t=t, q=q, tau=np.asarray(gain) * tau, joints=model.joints, path="run.csv")
 
 
-def uneven(robot):
-    """Move the centres of mass by a fifth of the radius of gyration."""
-    rng = np.random.default_rng(1)
-    for body in robot.inertias.tolist()[1:]:
-        radius = np.sqrt(np.trace(body.inertia) / body.mass)
-        body.lever += 0.3 * radius * rng.uniform(-1.0, 1.0, 3)
+def pulled(model, log):
+    """Return a log with a force beside the last link, constant in the world."""
+    engine, point, force = model.pin_model, np.array([-0.2, -0.1, -0.1]), [-13.0, -6.0, 2.0]
+    data, tau = engine.createData(), log.tau.copy()
+    for k, q in enumerate(log.q):
+        J = pin.computeJointJacobian(engine, data, q, 6)
+        pin.forwardKinematics(engine, data, q)
+        tau[k] -= (J[:3].T + np.cross(J[3:].T, point)) @ data.oMi[6].rotation.T @ force
+    return replace(log, tau=tau)
 
 
 def hung(robot):
@@ -169,7 +173,8 @@ SHIFT = np.pi / 2 * np.array([0.0, 1.0, 0.0, 0.0, 1.0, 0.0])
 QUARTER = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 READ = {
     "as it is": (lambda m: (m, recorded(m)), {}),
-    "other centres of mass": (lambda m: (m, recorded(m, uneven)), {}),
+    "other bodies": (lambda m: (m, recorded(with_other_bodies(m, np.random.default_rng(0)))), {}),
+    "pulled": (lambda m: (m, pulled(m, recorded(m))), {"unexplained_torque": ("wrist_3_joint",)}),
     "clock": (lambda m: (m, (x := recorded(m), replace(x, t=2 * x.t))[1]), {"time_scale": ()}),
     "slow": (lambda m: (m, (x := recorded(m), replace(x, t=1.25 * x.t))[1]), {"time_scale": ()}),
     "two zeros": (lambda m: (m, (x := recorded(m), replace(x, q=x.q + SHIFT))[1]), {
