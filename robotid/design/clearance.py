@@ -234,19 +234,18 @@ class Clearance:
         is_near = bound[pairs, samples] < limit[pairs, samples]
         pairs, samples = pairs[is_near], samples[is_near]
         shapes = [[self._hulls[k].shape for k in side] for side in hulls[:, is_near].tolist()]
-        poses = [
-            [coal.Transform3s(R, x) for R, x in zip(turns[is_near], places[is_near], strict=True)]
-            for turns, places in zip(rotations, centres, strict=True)
-        ]
-        count, result, exact = len(pairs), coal.DistanceResult(), np.empty(len(pairs))
-        points, normals = np.empty((2, count, 3)), np.empty((count, 3))
-        for k, sides in enumerate(zip(shapes[0], poses[0], shapes[1], poses[1], strict=True)):
+        both = zip(*shapes, *rotations[:, is_near], *centres[:, is_near], strict=True)
+        first, other, result = coal.Transform3s(), coal.Transform3s(), coal.DistanceResult()
+        exact, (points, normals) = np.empty(len(pairs)), np.empty((2, len(pairs), 3))
+        for k, (A, B, R_A, R_B, p_A, p_B) in enumerate(both):
+            first.setTransform(R_A, p_A)
+            other.setTransform(R_B, p_B)
             result.clear()
-            exact[k] = coal.distance(*sides, self._request, result)
-            points[:, k] = result.getNearestPoint1(), result.getNearestPoint2()
-            normals[k] = result.normal
+            exact[k] = coal.distance(A, first, B, other, self._request, result)
+            points[k], normals[k] = result.getNearestPoint1(), result.normal
+        nearest = np.stack([points, points + exact[:, None] * normals])  # of both
         bound[pairs, samples] = exact
-        gradient = self._gradient(placed, pairs, samples, points, normals)
+        gradient = self._gradient(placed, pairs, samples, nearest, normals)
         return Nearness(bound, pairs, samples, gradient)
 
     def nearest(self, motion: Motion, duration: float) -> Contact | None:
