@@ -236,16 +236,16 @@ class Clearance:
         shapes = [[self._hulls[k].shape for k in side] for side in hulls[:, is_near].tolist()]
         both = zip(*shapes, *rotations[:, is_near], *centres[:, is_near], strict=True)
         first, other, result = coal.Transform3s(), coal.Transform3s(), coal.DistanceResult()
-        exact, (points, normals) = np.empty(len(pairs)), np.empty((2, len(pairs), 3))
+        exact, (*points, normals) = np.empty(len(pairs)), np.empty((3, len(pairs), 3))
         for k, (A, B, R_A, R_B, p_A, p_B) in enumerate(both):
             first.setTransform(R_A, p_A)
             other.setTransform(R_B, p_B)
             result.clear()
             exact[k] = coal.distance(A, first, B, other, self._request, result)
-            points[k], normals[k] = result.getNearestPoint1(), result.normal
-        nearest = np.stack([points, points + exact[:, None] * normals])  # of both
+            points[0][k], points[1][k] = result.getNearestPoint1(), result.getNearestPoint2()
+            normals[k] = result.normal
         bound[pairs, samples] = exact
-        gradient = self._gradient(placed, pairs, samples, nearest, normals)
+        gradient = self._gradient(placed, pairs, samples, points, normals)
         return Nearness(bound, pairs, samples, gradient)
 
     def nearest(self, motion: Motion, duration: float) -> Contact | None:
@@ -333,7 +333,7 @@ class Clearance:
         return np.where(is_fixed, middles, centres), np.ascontiguousarray(rotations)
 
     def _gradient(
-        self, placed: Placements, pairs: Array, samples: Array, points: Array, normals: Array
+        self, placed: Placements, pairs: Array, samples: Array, points: list[Array], normals: Array
     ) -> Array:
         """Return distances' derivatives by each joint: normal . (velocity of nearest points)."""
         prismatic = self._tree.prismatic[:, None]
