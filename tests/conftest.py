@@ -93,7 +93,7 @@ def pytest_collection_finish():
 
 
 @pytest.fixture(scope="session")
-def plain():
+def model():
     return arm()
 
 

@@ -16,6 +16,7 @@ from robotid.diagnosis.logs import readings
 from robotid.diagnosis.logs.probe import Probe, drive_columns
 from robotid.diagnosis.logs.readings import EXPLAINED, Best, Samples
 from robotid.robot.model import RobotModel
+from robotid.robot.prior import assumed_masses
 
 _UNEXPLAINED = 0.25  # unexplained share of a torque's variance that is reported, not accepted
 _SPREAD = 0.3  # prior standard deviation of a link's mass, relative to the URDF's
@@ -62,7 +63,7 @@ class TorqueCheck:
         """Yield another scale, a load or another robot, and torques that nothing explains."""
         model = self.probe.model
         bad = [j for x, _ in self.limbs for j in x.motion.rows if self.share[j] > _UNEXPLAINED]
-        if not model.constraints:
+        if not (model.constraints or assumed_masses(model)):
             yield from _check_loads(self.probe, self.share, name, not bad)
         if 2 * len(bad) > len(model.joints):
             yield finding(

@@ -9,7 +9,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.corruptions import CASES, NOISE, ROBOTS, clean_log, controlled_log, robot, table_of
-from helpers.driven import arm
 from helpers.synthetic import exact_log, perfect, truth
 
 from robotid.base.findings import Finding, grouped
@@ -367,8 +366,7 @@ def test_a_clean_log_of_a_small_arm_at_30_hertz_raises_no_alarm(name):
     assert ("rounded_rpy" in {f.code for f in found}) == (name == "so101.urdf")
 
 
-def test_check_logs_asks_the_doctor_with_the_default_signals(rng):
-    model = arm()
+def test_check_logs_asks_the_doctor_with_the_default_signals(model, rng):
     log, other = (exact_log(model, truth(model), rng, samples=400) for _ in range(2))
     log = replace(log, tau=log.tau[:, [1, 0, 2]], path="fit.csv")
     kept = [replace(other, path="kept.csv"), replace(log, path="again.csv")]
