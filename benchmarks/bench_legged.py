@@ -356,7 +356,7 @@ def main():
     runs, seconds = (1, 4.0) if options.quick else (options.runs, options.seconds)
     if not options.faults:
         print(UNSEEN if options.unseen else COVERAGE)
-    for name in ("go1", "cassie") if options.quick else options.robots:
+    for name in ("go1",) if options.quick else options.robots:
         if options.faults:
             faults(name, range(options.first, options.first + runs), seconds)
         elif options.unseen:

@@ -46,8 +46,8 @@ def main():
     if options.write:
         write(Path(options.write[0]), int(options.write[1]))
         return
-    logs = {"parquet": 20_000} if options.quick else {"csv": 10**6, "parquet": 10**7}
-    held = 8192 if options.quick else None
+    logs = {"parquet": 5_000} if options.quick else {"csv": 10**6, "parquet": 10**7}
+    held = 2048 if options.quick else None
     print("| log | rows | file, MB | peak, MB | s | in memory: peak, MB | s | difference |")
     print("|" + "---|" * 8)
     with tempfile.TemporaryDirectory() as folder:

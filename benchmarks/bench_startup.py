@@ -49,7 +49,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="fewer processes")
     options = parser.parse_args()
-    seconds = in_turn(PROGRAMS.values(), 3 if options.quick else 15)
+    seconds = in_turn(PROGRAMS.values(), 1 if options.quick else 15)
     times = dict(zip(PROGRAMS, seconds, strict=True))
     bare, pinocchio = times["bare Python"], times["import pinocchio"]
     print("| program | s | over bare Python, s | ratio to import pinocchio |")

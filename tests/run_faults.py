@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-TIMEOUT = 600  # [s] tests that take longer show nothing
+TIMEOUT = 300  # [s] tests that take longer show nothing
 COPIED = ("robotid", "tests", "urdf", "docs", "benchmarks", "README.md", "pyproject.toml")
 EMPTY = "4b825dc642cb6eb9a060e54bf8d69288fbee4904"  # git's tree without files
 OPERATORS = re.compile(r"/(Replace(Bin|Un|Comp|And|Or|True|False)|NumberReplacer|AddNot)")
@@ -100,7 +100,8 @@ def mutations(count: int, since: str | None, only: str, rng: random.Random) -> I
             if occurrence is not None:
                 code = mutate_code(before, get_operator(name)(), occurrence)
                 count -= 1
-                yield Fault(file, code, f"{line}: {line_of(code, line).strip()}", tests_of(file))
+                label = f"{line}: {code.splitlines()[line - 1].strip()}"
+                yield Fault(file, code, label, tests_of(Path(file)))
                 break
 
 
@@ -114,11 +115,8 @@ def changed_lines(since: str | None) -> list[tuple[str, int]]:
             file = row.removeprefix("+++ b/")
         elif hunk := re.match(r"@@ -\S+ \+(\d+)(?:,(\d+))? @@", row):
             pairs += [(file, int(hunk[1]) + k) for k in range(int(hunk[2] or 1))]
-    return [(file, k) for file, k in pairs if line_of((ROOT / file).read_text(), k)[:4] == "    "]
-
-
-def line_of(code: str, line: int) -> str:
-    return code.splitlines()[line - 1]
+    code = {file: (ROOT / file).read_text().splitlines() for file, _ in pairs}
+    return [(file, k) for file, k in pairs if code[file][k - 1].startswith("    ")]
 
 
 def first_in_line(nodes: list, line: int, operator) -> int | None:
@@ -132,12 +130,14 @@ def first_in_line(nodes: list, line: int, operator) -> int | None:
     return None
 
 
-def tests_of(file: str) -> list[str]:
-    """Return the folder of tests of the package of a file, the nearest there is."""
-    folder = Path("tests", *Path(file).parts[1:-1])
+def tests_of(file: Path) -> list[str]:
+    """Return the tests of the nearest folder there is of a file's package, its own first."""
+    folder = Path("tests", *file.parts[1:-1])
     while not (ROOT / folder).is_dir() or folder == Path("tests", "estimation"):
         folder = folder.parent
-    return [str(folder), "tests/figures"]
+    found = [path.relative_to(ROOT) for path in (ROOT / folder).rglob("test_*.py")]
+    found.sort(key=lambda path: (path.stem != f"test_{file.stem}", path))
+    return [*map(str, found), "tests/figures"]
 
 
 def try_fault(fault: Fault) -> bool:

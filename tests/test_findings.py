@@ -166,6 +166,8 @@ def test_of_several_numbers_a_sentence_has_the_range_or_the_one_that_its_slot_as
     some = [Finding("a", "note", "b", "", {"x": x}, "log", fault=fault) for x in sizes]
     assert sentence(some) == "log: 1.0 to 4.0 m, 1, 4, 4, type 2"
     assert sentence(some[:1]) == "log: 3.0 m, 3, 3, 3, type 3"
+    lists = [Finding("a", "note", "b", "", words={"x": x}, fault="{x!q}") for x in ("j, k", "k")]
+    assert sentence(lists) == "'j', 'k'"
 
 
 def still(log, joint, size, severity="warning"):

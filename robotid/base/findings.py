@@ -136,7 +136,9 @@ def _filled(values: Sequence[str | float], spec: str, how: str) -> str:
     """Return names with commas, or the range of numbers, or one of them."""
     numbers = sorted(value for value in values if not isinstance(value, str))
     if not numbers:
-        names = list(dict.fromkeys(f"'{x}'" if how == "q" else str(x) for x in values))
+        each = dict.fromkeys(map(str, values))  # names, or lists of names: each is given once
+        each = each if len(each) < 2 else dict.fromkeys(", ".join(each).split(", "))
+        names = [f"'{x}'" if how == "q" else x for x in each]
         return (" " if names[0].startswith("--") else ", ").join(names)
     bare = spec.removesuffix("~")
     unit = next((unit for unit in _FACTORS if bare.endswith(unit)), "")

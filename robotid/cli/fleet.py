@@ -36,6 +36,7 @@ from robotid.cli.job import (
     read_job,
     stated_path,
 )
+from robotid.cli.logs import Refused
 from robotid.data.files.parquet_files import read_text_table, write_rows
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.estimation.variation.groups import FEWEST_RUNS
@@ -192,23 +193,21 @@ def _unit(
 def identify_unit(unit: FleetUnit, threads: int | None) -> tuple[UnitRows, str]:
     """Identify a unit: rows of its result, of which a failure is one, and its report or ""."""
     del threads
-    refused: dict[Path, str] = {}
+    refused: Refused = []
     rows, html = UnitRows(), ""
     try:
         job = unit.stated()
-        identification = identify_job(
-            job, job.model(), WorkPlan(1),
-            refuse=lambda entry, error: refused.update({entry.path: str(error)}),
-        )  # fmt: skip
+        identification = identify_job(job, job.model(), WorkPlan(1), refused=refused)
         result = build_result(identification, job.to_dict())
-        used = [e.path for e in job.identification if e.path not in refused]
+        paths = {entry.path for entry, _ in refused}
+        used = [e.path for e in job.identification if e.path not in paths]
         rows += _rows(unit.unit, used, result)
         html = report_html(identification)
     except Exception as error:  # the fleet goes on: the error is in the table
         rows = [_failure(unit, error)]
     rows += [
-        {"unit": unit.unit, "log": str(path), "status": "failed", "error": error}
-        for path, error in refused.items()
+        {"unit": unit.unit, "log": str(entry.path), "status": "failed", "error": str(error)}
+        for entry, error in refused
     ]
     return rows, html
 

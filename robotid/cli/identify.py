@@ -36,7 +36,7 @@ from robotid.cli.job import (
     source_words,
 )
 from robotid.cli.logs import (
-    Refuse,
+    Refused,
     examine_logs,
     locked_as_logged,
     needed_of,
@@ -313,7 +313,7 @@ def _entries(evaluations: Sequence[Evaluated]) -> tuple[LogEntry, ...]:
 
 
 def identify_job(
-    job: Job, model: RobotModel, plan: WorkPlan, *, refuse: Refuse | None = None
+    job: Job, model: RobotModel, plan: WorkPlan, *, refused: Refused | None = None
 ) -> Identification:
     """Identify from a job's logs; nothing is written."""
     check_ignored(job.ignore)
@@ -331,7 +331,7 @@ def identify_job(
             progress=plan.progress or ignore_progress,
         )  # fmt: skip
         return replace(identification, stated=replace(identification.stated, job=job))
-    fitted, validation = survey_logs(job, model, *groups, refuse=refuse)
+    fitted, validation = survey_logs(job, model, *groups, refused=refused)
     if not fitted:
         which = "no log is usable" if job.identification else "no log is given"
         raise DataError(f"{which}, expected at least one to identify from")

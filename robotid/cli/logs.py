@@ -1,6 +1,6 @@
 """The logs of a job: opened once, examined, and identified by their inputs."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import chain
@@ -11,7 +11,7 @@ import numpy as np
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import file_sha256, log_exists
-from robotid.base.findings import Finding, by_severity
+from robotid.base.findings import Finding, by_severity, listed
 from robotid.base.typing import STAGES, ProgressCallback, report_stage
 from robotid.cli.job import Job, LogEntry, written_job
 from robotid.data.files.columns import Needs
@@ -35,9 +35,8 @@ if TYPE_CHECKING:
 _PIECES = 8  # pieces per rows in memory: the filter of a piece needs memory of its own
 _SHORTEST = 256  # rows of a piece
 
-
-#: Called with a log that cannot be read, in place of raising the error.
-Refuse: TypeAlias = Callable[[LogEntry, DataError], None]
+#: Logs that cannot be read, and why.
+Refused: TypeAlias = list[tuple[LogEntry, DataError]]
 Surveyed: TypeAlias = tuple[SurveyedLog, ...]
 
 
@@ -45,16 +44,17 @@ def survey_logs(
     job: Job,
     model: RobotModel,
     *groups: Sequence[LogEntry],
-    refuse: Refuse | None = None,
+    refused: Refused | None = None,
     needs: Needs = "torque",
 ) -> tuple[Surveyed, ...]:
-    """Return the logs of each group, ready to be read."""
+    """Return the logs of each group, ready to be read; faulty ones go into refused, or raise."""
     paths = dict.fromkeys(entry.path for entry in chain(*groups))
     opened = {path: _open(job, model, path, needs) for path in paths}
     tables = [file[1].rows for file in opened.values() if not isinstance(file, DataError)]
     rows = sum(table.count() for table in tables if table is not None)  # if not only read whole
     is_long = rows > job.rows_in_memory and not model.is_static
     length = max(job.rows_in_memory // _PIECES, _SHORTEST) if is_long else None
+    faults: Refused = [] if refused is None else refused
 
     def survey(entries: Sequence[LogEntry]) -> Surveyed:
         logs = []
@@ -68,12 +68,26 @@ def survey_logs(
                 log = survey_log(*file, model, job.signals, window, length=length)
                 logs.append(replace(log, unit=entry.unit or ""))
             except DataError as error:
-                if refuse is None:
-                    raise
-                refuse(entry, error)
+                faults.append((entry, error))
         return tuple(logs)
 
-    return tuple(survey(entries) for entries in groups)
+    surveyed = tuple(survey(entries) for entries in groups)
+    if faults and refused is None:
+        errors = [error for _, error in _by_fault(faults)]
+        raise DataError("\n".join(map(str, errors)), errors[0].code)
+    return surveyed
+
+
+def _by_fault(refused: Refused) -> Iterator[tuple[str, DataError]]:
+    """Yield the logs with each fault, and its error in the first of them, which names all."""
+    faults: dict[str, dict[str, DataError]] = {}
+    for entry, error in refused:
+        fault = str(error) if error.code == "unusable_log" else error.code  # the code of any other
+        faults.setdefault(fault, {}).setdefault(entry.path.name, error)
+    for logs in faults.values():
+        first, *others = logs.values()
+        same = f"{listed(logs)} have the same fault ({first.code}). " if others else ""
+        yield listed(logs), DataError(f"{same}{first}", first.code)
 
 
 def units_of_logs(entries: Sequence[LogEntry]) -> list[str]:
@@ -96,17 +110,14 @@ def examine(
     if not (job.identification or job.validation):
         raise SettingsError("the job has no log; add one: [[identification]] with log = FILE")
     model = model or job.model()
-    refused: list[Finding] = []
-
-    def refuse(entry: LogEntry, error: DataError) -> None:
-        refused.append(Finding(error.code, "error", entry.path.name, str(error)))
-
+    refused: Refused = []
     report_stage(progress, "reading logs", STAGES[:2])
     groups = job.identification, job.validation
-    fitted, validation = survey_logs(job, model, *groups, refuse=refuse, needs="any")
+    fitted, validation = survey_logs(job, model, *groups, refused=refused, needs="any")
     report_stage(progress, "checking logs", STAGES[:2])
     job, model, first, second, notes = locked_as_logged(job, model, fitted, validation)
-    return by_severity([*refused, *notes, *examine_logs(job, model, first, second)])
+    faults = [Finding(x.code, "error", where, str(x)) for where, x in _by_fault(refused)]
+    return by_severity([*faults, *notes, *examine_logs(job, model, first, second)])
 
 
 def locked_as_logged(

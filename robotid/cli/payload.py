@@ -144,7 +144,7 @@ def _show(content: dict[str, Any]) -> None:
     if "gains" in content:
         checked = "the gains are those with which this payload has the given mass"
         echo(f"{checked}; verify them with another payload or another log of it", "  ")
-        print("\n[torque.gains]")
+        print("\n[torque.gains]  # [N m/A], of prismatic joints [N/A]")
         for joint, gain in content["gains"].items():
             low, high = gain["interval"]
             value, _ = in_digits_of(gain["gain"], gain["std_error"])
@@ -161,11 +161,8 @@ def _print_one_payload(load: Mapping[str, Any], check: Mapping[str, Any] | None)
             echo(f"  scale of the torques: {check['message']}", "  ")
     else:
         low, high = (in_digits_of(end, load["mass_std_error"])[0] for end in load["mass_interval"])
-        scale = "torque gains that are too large give a mass that is too large"
-        echo(
-            f"  mass {mass} kg (95 % interval {low} to {high}). It is proportional to the torque "
-            f"scale: {scale}", "  ",
-        )  # fmt: skip
+        scale = "It is proportional to the torque scale: gains that are 5 % too large add 5 %"
+        echo(f"  mass {mass} kg (95 % interval {low} to {high}). {scale}", "  ")
     if load["com"] is not None:
         print(f"  centre of mass in the frame of {link} [m]")
         _print_values(zip("xyz", load["com"], load["com_std_error"], strict=True))

@@ -234,16 +234,15 @@ class Clearance:
         is_near = bound[pairs, samples] < limit[pairs, samples]
         pairs, samples = pairs[is_near], samples[is_near]
         shapes = [[self._hulls[k].shape for k in side] for side in hulls[:, is_near].tolist()]
-        poses = [
-            [coal.Transform3s(R, x) for R, x in zip(turns[is_near], places[is_near], strict=True)]
-            for turns, places in zip(rotations, centres, strict=True)
-        ]
-        count, result, exact = len(pairs), coal.DistanceResult(), np.empty(len(pairs))
-        points, normals = np.empty((2, count, 3)), np.empty((count, 3))
-        for k, sides in enumerate(zip(shapes[0], poses[0], shapes[1], poses[1], strict=True)):
+        both = zip(*shapes, *rotations[:, is_near], *centres[:, is_near], strict=True)
+        first, other, result = coal.Transform3s(), coal.Transform3s(), coal.DistanceResult()
+        exact, (*points, normals) = np.empty(len(pairs)), np.empty((3, len(pairs), 3))
+        for k, (A, B, R_A, R_B, p_A, p_B) in enumerate(both):
+            first.setTransform(R_A, p_A)
+            other.setTransform(R_B, p_B)
             result.clear()
-            exact[k] = coal.distance(*sides, self._request, result)
-            points[:, k] = result.getNearestPoint1(), result.getNearestPoint2()
+            exact[k] = coal.distance(A, first, B, other, self._request, result)
+            points[0][k], points[1][k] = result.getNearestPoint1(), result.getNearestPoint2()
             normals[k] = result.normal
         bound[pairs, samples] = exact
         gradient = self._gradient(placed, pairs, samples, points, normals)
@@ -334,7 +333,7 @@ class Clearance:
         return np.where(is_fixed, middles, centres), np.ascontiguousarray(rotations)
 
     def _gradient(
-        self, placed: Placements, pairs: Array, samples: Array, points: Array, normals: Array
+        self, placed: Placements, pairs: Array, samples: Array, points: list[Array], normals: Array
     ) -> Array:
         """Return distances' derivatives by each joint: normal . (velocity of nearest points)."""
         prismatic = self._tree.prismatic[:, None]

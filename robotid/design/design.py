@@ -68,13 +68,10 @@ _RATE = 100.0  # [Hz] of the samples at which limits are checked
 
 @dataclass(frozen=True)
 class FourierBasis:
-    """Sines and cosines of the first harmonics of 1 / duration, at rest at both ends.
+    """Sines and cosines of the first harmonics of 1 / duration (Swevers 1997), at rest at the ends.
 
     The first function is constant 1. Two of the 2 h coefficients of a joint are fixed by the ends:
     sum k s_k = 0 makes its velocity 0 there, and sum k^2 c_k = 0 its acceleration.
-
-    References:
-        Swevers et al. (1997), Optimal robot excitation and identification.
     """
 
     duration: float  # [s]
@@ -258,6 +255,8 @@ class Designer:
         """Return the best motion, checked on a grid 15 times as fine as the first one."""
         began, best = time.monotonic(), np.inf
         followed: list[State] = []
+        designs: list[Design] = []
+        fine, finest = (replace(self, finer=k * self.finer) for k in (_POLISHED, _FINER))
 
         def is_over() -> bool:
             return best < np.inf and time.monotonic() - began > seconds
@@ -270,24 +269,29 @@ class Designer:
                     progress(len(followed), best)
             return state
 
+        def polished(state: State) -> Design:
+            feasible = fine._feasible(state.feasible, 1.0 - SPARE)
+            multipliers = state.multipliers.finer(_POLISHED)
+            initial = State(feasible, fine._objective(feasible), state.iterate, multipliers)
+            state = follow(fine, initial, _SETTLED)
+            return replace(finest.checked(state.feasible), is_converged=state.is_settled)
+
         while len(followed) < starts and not is_over():
             random = [self.random(rng) for _ in range(_STARTED)]
             objective, k = min((self._objective(C), k) for k, C in enumerate(random))
             multipliers = Multipliers(_WEIGHT / self._functions.shape[1])
-            initial = State(random[k], objective, random[k], multipliers)
-            followed.append(follow(self, initial, _NEARLY))
-        chosen = min(followed, key=lambda state: state.objective)
-        fine, best = replace(self, finer=_POLISHED * self.finer), np.inf
-        feasible = fine._feasible(chosen.feasible, 1.0 - SPARE)
-        multipliers = chosen.multipliers.finer(_POLISHED)
-        initial = State(feasible, fine._objective(feasible), chosen.iterate, multipliers)
-        polished = follow(fine, initial, _SETTLED)
-        return replace(
-            replace(self, finer=_FINER * self.finer).checked(polished.feasible),
-            seconds=time.monotonic() - began,
-            starts=len(followed),
-            is_converged=polished.is_settled,
-        )
+            followed.append(
+                follow(self, State(random[k], objective, random[k], multipliers), _NEARLY)
+            )
+            before = min((state.objective for state in followed[:-1]), default=np.inf)
+            is_better = followed[-1].objective < before - _NEARLY
+            # with limited time each better start is polished: more time gives no worse motion
+            if seconds < np.inf and is_better and not (designs and is_over()):
+                designs.append(polished(followed[-1]))
+        if not designs:
+            designs.append(polished(min(followed, key=lambda state: state.objective)))
+        chosen = min(designs, key=lambda design: design.objective)
+        return replace(chosen, seconds=time.monotonic() - began, starts=len(followed))
 
     def checked(self, C: Array) -> Design:
         """Return a motion, scaled down until it satisfies all limits, also between the samples."""

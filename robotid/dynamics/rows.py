@@ -369,6 +369,20 @@ def inertial_rows(model: RobotModel, q: Array, v: Array, a: Array) -> InertialRo
     return InertialRows(model.pin_model, tuple(plan.inertial), values)
 
 
+def write_inertial(
+    model: RobotModel, q: Array, v: Array, a: Array, Y: Array, data: pin.Data | None = None
+) -> None:
+    """Write the inertial columns into the regressors of N samples, shape (N, n_rows, p)."""
+    regressor, pin_model = pin.computeJointTorqueRegressor, model.pin_model
+    data = data or pin_model.createData()
+    G = _inertial_plan(model)[1].G
+    v, a = (v, a) if G is None else (v @ G.T, a @ G.T)
+    states = zip(Y[:, :, : model.layout.n_inertial], model.configurations(q), v, a, strict=True)
+    for Y_k, q_k, v_k, a_k in states:
+        inertial = regressor(pin_model, data, q_k, v_k, a_k)
+        Y_k[:] = inertial if G is None else G.T @ inertial
+
+
 def keep_inertial_rows(model: RobotModel, trajectory: Trajectory) -> None:
     """Store the inertial columns of a trajectory with it, unless they are many or compiled."""
     columns, samples = _inertial_support(model), len(trajectory.t)

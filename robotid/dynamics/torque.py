@@ -1,7 +1,7 @@
 """Torques: their regressor, predictions from parameter vectors, and derivatives.
 
 Inertial columns are Pinocchio's; those of the drives follow them. Derivatives are Pinocchio's of
-inverse dynamics: three prismatic joints at position 0 before each joint displace its origin.
+inverse dynamics: a joint of six axes at position 0 before each joint moves its origin and axis.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -27,12 +27,12 @@ from robotid.dynamics.rows import (
     drive_motion,
     drive_values,
     friction_directions,
-    inertial_rows,
     kept_rows,
     remembered,
     trajectory_rows,
     trajectory_values,
     work_per_sample,
+    write_inertial,
 )
 from robotid.robot.closure import Chains
 from robotid.robot.drive_term import DriveMotion
@@ -67,21 +67,24 @@ def joint_torque_regressor(
             row = model.row_names[j]
             raise DataError(f"{name}[{k}] of {row} is {values[k, j]}, expected a finite number")
     Y = np.zeros((len(q), model.n_rows, len(model.layout.names)))
-    inertial_rows(model, q, v, a).write(slice(None), Y)
+    write_inertial(model, q, v, a, Y)
     _write_drives(model, (q, v, a), direction, memory, Y)
     return Y.reshape(len(q) * model.n_rows, -1)
 
 
 def trajectory_regressor(
-    model: RobotModel, trajectory: Trajectory, samples: Array | None = None
+    model: RobotModel,
+    trajectory: Trajectory,
+    samples: Array | slice = slice(None),
+    data: pin.Data | None = None,
 ) -> Array:
     """Return the regressor of N samples of a trajectory, (N n_rows, p); constrained: P W."""
-    m = trajectory if samples is None else trajectory.at(samples)
+    m = trajectory.at(samples)
     Y = np.zeros((len(m.t), model.n_rows, len(model.layout.names)))
     if (stored := kept_rows(model, trajectory)) is None:
-        inertial_rows(model, m.q, m.v, m.a).write(slice(None), Y)
+        write_inertial(model, m.q, m.v, m.a, Y, data)
     else:
-        stored.write(slice(None) if samples is None else samples, Y)
+        stored.write(samples, Y)
     _write_drives(model, (m.q, m.v, m.a), m.direction, m.memory, Y)
     Y = Y if m.basis is None else without_forces(m.basis, Y)
     return Y.reshape(len(m.t) * model.n_rows, -1)
@@ -151,14 +154,10 @@ def build_problem(
     length = max(1, min(BLOCK, BLOCK_SIZE // (model.n_rows * len(model.layout.names))))
 
     def stream() -> Iterator[Block]:
-        m = trajectory
+        data = model.pin_model.createData()
         for start in range(0, samples, length):
             part = slice(start, start + length)
-            known = (None if x is None else x[part] for x in (m.direction, m.memory))
-            W = joint_torque_regressor(model, m.q[part], m.v[part], m.a[part], *known)
-            if m.basis is not None:
-                Y = W.reshape(-1, model.n_rows, W.shape[1])
-                W = without_forces(m.basis[part], Y).reshape(W.shape)
+            W = trajectory_regressor(model, trajectory, part, data)
             yield W, trajectory.tau[part].reshape(-1), weights[part].reshape(-1)
 
     is_projected = trajectory.basis is not None

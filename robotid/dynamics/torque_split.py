@@ -20,9 +20,7 @@ _RIGID = ("gravity", "inertia", "Coriolis")
 
 @dataclass(frozen=True, eq=False)
 class TorqueSplit:
-    """Parts of predicted torques."""
-
-    # "gravity", "inertia", "Coriolis" of bodies, then those of drives, by ``DriveTerm.part``.
+    """Parts of torques: "gravity", "inertia", "Coriolis", then of drives by ``DriveTerm.part``."""
 
     parts: Mapping[str, Array]  # each of shape (N, n_rows) [N m, N]
     names: tuple[str, ...]  # of the k drive parameters
@@ -49,10 +47,9 @@ def split_torque(
     direction: Array | None = None, memory: Array | None = None,
 ) -> TorqueSplit:  # fmt: skip
     """Return the parts of the torques that parameters predict."""
-    # A static model has no torques of motion: gravity is the only part of the bodies.
     layout, first = model.layout, model.n_rows - len(model.joints)
     parts = dict(zip(_RIGID, rigid_parts(model, pi, q, v, a), strict=True))
-    if model.is_static:
+    if model.is_static:  # it has no torques of motion
         parts = {"gravity": parts["gravity"]}
     signs = friction_directions(layout, v, direction)
     terms = pi[layout.n_inertial :, None] * drive_values(layout, q, v, a, signs, memory)  # (k, N)
@@ -65,8 +62,7 @@ def split_torque(
 
 
 def friction_split(model: RobotModel, trajectory: Trajectory, pi: Array) -> tuple[Array, Array]:
-    """Return the measured torque without rigid-body torques, and the identified friction."""
-    # tau - Y pi, with pi without friction and offset, and their torque.
+    """Return tau - Y pi, with pi without friction and offset, and the torque of these."""
     layout = model.layout
     is_drive_inertia = [term.is_inertia for _, term in layout.drive_parameters]
     stiff = np.array([True] * layout.n_inertial + is_drive_inertia)

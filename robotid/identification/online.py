@@ -143,14 +143,11 @@ class Payload:
 
 
 class ChangeDetector:
-    """CUSUM on squared innovations, row by row.
+    """CUSUM on squared innovations, row by row (Page 1954, Continuous Inspection Schemes).
 
     With the squared innovation d_j^2 in units of its variance, the evidence is
     g_j <- max(0, g_j + share (min(d_j^2, 25) - 4)), and a change is flagged when one g_j
     reaches the threshold. The onset of the change is the time at which that g_j last left 0.
-
-    References:
-        Page (1954), Continuous Inspection Schemes.
     """
 
     def __init__(self, n: int, threshold: float) -> None:
@@ -159,8 +156,7 @@ class ChangeDetector:
         self._onset = np.full(n, np.nan)
 
     def push(self, t: float, squares: Array, share: float) -> float | None:
-        """Process one sample; return the onset of a change flagged now [s], else None."""
-        # squares (n,)
+        """Return the onset of a change that the squares (n,) of a sample flag [s], else None."""
         evidence = self.evidence + share * (np.minimum(squares, _LARGEST) - _DRIFT)
         evidence[squares == 0.0] = self.evidence[squares == 0.0]
         starts = (self.evidence <= 0.0) & (evidence > 0.0)
@@ -239,8 +235,7 @@ def payload_of(difference: Array, covariance: Array, columns: Array, spread: Arr
 
 
 def load_spread(spread: Array) -> Array:
-    """Return the prior standard deviations of a payload, (10,): of a mean link, twice its size."""
-    # spread (10 bodies,)
+    """Return prior deviations (10,) of a payload, a mean link of twice its size: spread (10 k,)."""
     by_body = spread.reshape(-1, 10)
     mass = max(float(by_body[:, 0].mean()), float(by_body[-1, 0]))
     radius = 2.0 * float(np.max(by_body[-1, 1:4]) / by_body[-1, 0])

@@ -79,8 +79,8 @@ def central_parameters(fit: Fit) -> CentralParameters:
     quantile = fit.standard_quantile[:size].reshape(n, 10).max(axis=1)
     urdf, values, half = (np.full((n, 10), np.nan) for _ in range(3))
     for i in range(n):
-        urdf[i], _ = _central(before[i])
-        values[i], G = _central(pi[i])
+        urdf[i], _ = about_com(before[i])
+        values[i], G = about_com(pi[i])
         own = slice(10 * i, 10 * i + 10)
         C = fit.standard_covariance[own, own]
         std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", G, C, G), 0.0))
@@ -88,7 +88,7 @@ def central_parameters(fit: Fit) -> CentralParameters:
     return CentralParameters(*(x[:, _ORDER] for x in (urdf, values, half)))
 
 
-def _central(pi: Array) -> tuple[Array, Array]:
+def about_com(pi: Array) -> tuple[Array, Array]:
     """Return m, c and I_c in Pinocchio's order, shape (10,), and their derivatives, (10, 10)."""
     # c = h / m and I_c = I - m (c c 1 - c c'), with the first moments h.
     m, G = float(pi[0]), np.eye(10)

@@ -23,8 +23,9 @@ from robotid.estimation.estimators.two_runs import Compared, TwoRuns, payload_ru
 from robotid.estimation.fitting.estimator_settings import ConsistentSettings
 from robotid.estimation.fitting.fit import MOST_LOADS
 from robotid.estimation.fitting.recorded import Recordings
+from robotid.identification.parameter_table import about_com
 from robotid.identification.pipeline import in_memory, logs_of, robot_of, with_drives
-from robotid.robot.bodies import link_transfer, usual_links
+from robotid.robot.bodies import link_transfer, parameters_about, usual_links
 from robotid.robot.closure import refuse_loops
 from robotid.robot.drive_term import DriveTerm
 from robotid.robot.drives import AUTO, wanted_families
@@ -62,14 +63,12 @@ class Payload:
     @property
     def inertia_at_link(self) -> Array:
         """Inertia about the origin of the link's frame, shape (3, 3) [kg m^2]."""
-        c = self.com
-        return np.asarray(self.inertia + self.mass * (c @ c * np.eye(3) - np.outer(c, c)))
+        return np.asarray(self.parameters[4:][(_PACKED,)])
 
     @property
     def parameters(self) -> Array:
         """The ten inertial parameters in the link's frame, shape (10,)."""
-        (xx, xy, xz), (_, yy, yz), (_, _, zz) = self.inertia_at_link.tolist()
-        return np.array([self.mass, *(self.mass * self.com), xx, xy, yy, xz, yz, zz])
+        return parameters_about(self.mass, self.com, self.inertia)
 
     def lines(self) -> list[str]:
         """Return mass, centre of mass and inertia as text, or why they are not determined."""
@@ -168,13 +167,11 @@ class PayloadFit:
 
 def payload_of(model: RobotModel, link: str, x: Array, C: Array, freedom: Array) -> Payload:
     """Return a payload from its ten parameters; first-order errors of derived quantities."""
-    step = 1e-20  # complex-step derivative: exact
-    shown = _about_com(x)
-    J = np.column_stack([_about_com(x + 1j * step * e).imag / step for e in np.eye(10)])
+    shown, J = about_com(x)
     errors = np.sqrt(np.maximum(np.diag(J @ C @ J.T), 0.0))
     mass, error, t = float(x[0]), float(np.sqrt(C[0, 0])), float(quantile(freedom[:1])[0])
-    com, com_error = shown[:3].real, errors[:3]
-    inertia, inertia_error = shown[3:].real[(_PACKED,)], errors[3:][(_PACKED,)]
+    com, com_error = shown[1:4], errors[1:4]
+    inertia, inertia_error = shown[4:][(_PACKED,)], errors[4:][(_PACKED,)]
     moment, largest = float(np.trace(inertia)) / 3, float(inertia_error.max())
     reasons = {}
     if com_error.max() > _SMALL * model.length:
@@ -193,14 +190,6 @@ def payload_of(model: RobotModel, link: str, x: Array, C: Array, freedom: Array)
         reasons = dict.fromkeys(("com", "inertia"), words)
     interval = np.array([mass - t * error, mass + t * error])
     return Payload(link, mass, error, interval, com, com_error, inertia, inertia_error, reasons)
-
-
-def _about_com(x: Array) -> Array:
-    """Return centre of mass and inertia about it, xx xy yy xz yz zz, of ten parameters, (9,)."""
-    m, mc = x[0], x[1:4]
-    steiner = (mc @ mc * np.eye(3) - np.outer(mc, mc)) / m
-    i, j = (0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2)
-    return np.concatenate([mc / m, x[4:] - steiner[i, j]])
 
 
 class UndeterminedMassError(DataError):

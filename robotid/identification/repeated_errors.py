@@ -3,18 +3,15 @@
 A force f that acts x beside the stated point adds D x = J_w^T (x x f) to the torque, with the
 Jacobian J_w of the link's rotation. Feet that deform, or are not balls, cause such errors in every
 step, so that the scatter of the residual does not contain them. With offsets x ~ N(0, s^2) the
-score W^T tau has the covariance s^2 W^T D D^T W beside that of its noise. If s is not given, it
-has the largest evidence, and in place of s^2 I all points have the mean over points of E[x x^T],
-given the rows. Without torques of joints an offset is like a displaced centre of mass: s then is 2
-cm.
+score W^T tau has the covariance s^2 W^T D D^T W beside that of its noise. If s is not given, it has
+the largest evidence (Bishop 2006, Pattern Recognition and Machine Learning, section 3.5), and in
+place of s^2 I all points have the mean over points of E[x x^T], given the rows. Without torques of
+joints an offset is like a displaced centre of mass: s then is 2 cm.
 
 A bias of the accelerometers acts as a change of gravity with the axes of the base; D then has the
 torque per acceleration of the base. The bias is estimated together with the parameters, where the
 base turns, and subtracted; the covariance D Cov(b) D^T is left in the score. Its prior size: a
 robot hardly moves away, so its mean acceleration in the world is that of the bias.
-
-References:
-    Bishop (2006), Pattern Recognition and Machine Learning, section 3.5 (evidence).
 """
 
 from collections.abc import Sequence

@@ -113,20 +113,20 @@ def one_more_gain(parameter: Mapping[str, Any]) -> tuple[float, float]:
 def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
     """Return a verdict as text: status, reasons (a joint's as its line), other joints, uses."""
     by_cell: dict[str, list[str]] = {}
-    for name, joint in verdict["per_joint"].items():
-        by_cell.setdefault(verdict_cell(name, joint), []).append(name)
+    cell_of = {name: verdict_cell(name, joint) for name, joint in verdict["per_joint"].items()}
+    for name, words in cell_of.items():
+        by_cell.setdefault(words, []).append(name)
     if list(by_cell) == ["good"]:
         by_cell = {} if verdict["status"] == "good" else {"good": ["every joint"]}
     cells = {words: f"  {', '.join(names)}: {words}" for words, names in by_cell.items()}
-    of_joints = {
-        joint["reasons"][0]: verdict_cell(name, joint)
-        for name, joint in verdict["per_joint"].items()
-        if joint["reasons"]
-    }
-    lines = [
-        cells.get(of_joints[reason], "") if reason in of_joints else f"  - {reason}"
-        for reason in verdict["reasons"]
-    ]
+    firsts = {x: joint_reason(x, joint["reasons"]) for x, joint in verdict["per_joint"].items()}
+    lines = []
+    for reason in verdict["reasons"]:
+        about, _, words = reason.partition(": ")
+        named = set(about.split(", ")) & firsts.keys()
+        same = [joint for joint in firsts if firsts[joint] == (words if named else reason)]
+        is_first = same and named <= set(same)
+        lines.append(cells.get(cell_of[same[0]], "") if is_first else f"  - {reason}")
     in_order = dict.fromkeys([*filter(None, lines), *cells.values()])
     uses = uses_line(verdict.get("use_for", {}))
     return [f"verdict: {verdict['status']}", *in_order, *([uses] if uses else [])]
@@ -135,7 +135,9 @@ def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
 def verdict_cell(joint: str, verdict: Mapping[str, Any]) -> str:
     """Return the verdict on a joint with its first reason, as in "usable, error 20 % on b.csv"."""
     status, why = verdict["status"], joint_reason(joint, verdict["reasons"])
-    return str(status) if status == "good" or not why else f"{status}, {why}"
+    if status == "good" or not why:
+        return str(status)
+    return why if why.endswith(status) else f"{status}, {why}"
 
 
 def joint_reason(joint: str, reasons: Sequence[str]) -> str:

@@ -116,10 +116,12 @@ def inertial_parameters(inertial: Inertial) -> Array:
     ixx, ixy, ixz, iyy, iyz, izz = inertial.inertia
     moments = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
     R = pin.rpy.rpyToMatrix(*inertial.rpy)
-    m, c = inertial.mass, np.array(inertial.com)
-    about_origin = R @ moments @ R.T + m * (c @ c * np.eye(3) - np.outer(c, c))
-    (xx, xy, xz), (_, yy, yz), (_, _, zz) = about_origin.tolist()
-    return np.array([m, *(m * c), xx, xy, yy, xz, yz, zz])
+    return parameters_about(inertial.mass, np.array(inertial.com), R @ moments @ R.T)
+
+
+def parameters_about(mass: float, com: Array, inertia: Array) -> Array:
+    """Return the ten parameters of a body from its inertia (3, 3) about its centre of mass."""
+    return np.asarray(pin.Inertia(mass, com, inertia).toDynamicParameters())
 
 
 def negligible_bodies(model: RobotModel) -> tuple[str, ...]:
@@ -132,12 +134,9 @@ def negligible_bodies(model: RobotModel) -> tuple[str, ...]:
 
 def central_inertial(parameters: Array) -> Inertial:
     """Return mass, centre of mass and inertia about it from ten parameters in the link's frame."""
-    m, c = float(parameters[0]), parameters[1:4] / parameters[0]
-    xx, xy, yy, xz, yz, zz = parameters[4:]
-    about_origin = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    I = about_origin - m * (c @ c * np.eye(3) - np.outer(c, c))  # (3, 3), Steiner  # noqa: E741
-    moments = tuple(I[np.triu_indices(3)].tolist())  # ixx ixy ixz iyy iyz izz
-    return Inertial(m, tuple(c.tolist()), (0.0, 0.0, 0.0), moments)
+    body = pin.Inertia.FromDynamicParameters(parameters)
+    moments = tuple(body.inertia[np.triu_indices(3)].tolist())  # ixx ixy ixz iyy iyz izz
+    return Inertial(float(body.mass), tuple(body.lever.tolist()), (0.0, 0.0, 0.0), moments)
 
 
 def principal_moments(parameters: Array) -> tuple[Array, Array]:

@@ -123,7 +123,7 @@ def test_a_job_states_a_check_of_the_scale_in_its_result(files, tmp_path, ur5, c
     assert step.blocks[0] == wanted
     monkeypatch.chdir(files)
     assert main(shlex.split(step.blocks[0])[1:]) == 0
-    assert "[torque.gains]\nshoulder_pan_joint = 1" in capsys.readouterr().out
+    assert "[N/A]\nshoulder_pan_joint = 1" in capsys.readouterr().out
     typed = Origin((str(urdf), "bare.csv", "--gain", "elbow_joint=3", "--cutoff", "8"), "out")
     (step,) = [s for s in next_steps(found, typed) if "torque scale" in s.words]
     assert step.blocks[1:] == (
@@ -152,7 +152,7 @@ def test_gains_come_from_a_known_mass(files, capsys, ur5):
     assert all(entry["std_error"] > 0 for entry in found["base_parameters"])
     said = asked(capsys, *words, *STATED)
     assert "verify them with another payload or another log of it" in " ".join(said.split())
-    assert "[torque.gains]\nshoulder_pan_joint = 1" in said
+    assert "[N/A]\nshoulder_pan_joint = 1" in said
     stated = f"{ur5.joints[0]}={GAINS[0]}"
     some = json.loads(asked(capsys, *words, "--gain", stated, *STATED, "--json"))
     assert list(some["gains"]) == list(ur5.joints[1:])

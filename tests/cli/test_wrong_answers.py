@@ -115,7 +115,8 @@ def degrees(here):
 
 
 def milliseconds(here):
-    return here.refused("identify", URDF, here.write(replace(here.log, t=1000 * here.log.t)))
+    log = replace(here.log, t=1000 * here.log.t)
+    return here.refused("identify", URDF, here.write(log), "--validate", here.write(log, "b.csv"))
 
 
 def few_rows(here):

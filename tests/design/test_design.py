@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 import pytest
@@ -95,7 +96,7 @@ def test_a_design_keeps_its_limits_between_its_instants(wrist, designer, design)
     assert np.abs(a[[0, -1]]).max() < 1e-9
 
 
-def test_designs_are_the_same_under_a_seed_and_stop_when_told(designer):
+def test_designs_are_the_same_under_a_seed_and_no_worse_with_more_time(designer, monkeypatch):
     short = replace(designer, basis=FourierBasis(4.0, 2))
     told = []
     one, other = (
@@ -107,6 +108,12 @@ def test_designs_are_the_same_under_a_seed_and_stop_when_told(designer):
     np.testing.assert_array_equal(one.motion.coefficients, other.motion.coefficients)
     assert not one.is_converged
     assert one.used.max() <= 1.0
+    calls = count(step=1.0)  # a clock of calls, the same on every machine
+    monkeypatch.setattr("time.monotonic", lambda: next(calls))
+    few, many = (short.design(np.random.default_rng(3), starts=99, seconds=s) for s in (150, 600))
+    assert many.starts > few.starts
+    assert many.is_converged  # on the finer grid
+    assert many.objective <= few.objective
 
 
 def test_a_search_near_the_limits_continues_beyond_them_and_a_stalled_one_restarts(designer, rng):

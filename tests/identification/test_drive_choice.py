@@ -54,7 +54,7 @@ ALIKE = {"tanh": {"tanh", "stribeck"}, "stribeck": {"tanh", "stribeck"}}
 
 
 @pytest.fixture(scope="module")
-def cases(plain):
+def cases(model):
     """Each family on the elbow: the robot, its parameters and its log, made when asked for."""
     made = {}
 
@@ -63,7 +63,7 @@ def cases(plain):
             sizes, values = CASES[name]
             terms = FAMILIES[name].make(SEEN, *sizes)
             own = {f"{ELBOW}.{t.name}": x for t, x in zip(terms, values, strict=True)}
-            true, pi = driven(plain, {ELBOW: terms}, own)
+            true, pi = driven(model, {ELBOW: terms}, own)
             made[name] = (true, pi, driven_log(true, pi, SEED, reach=QUANTILE))
         return made[name]
 
@@ -71,9 +71,9 @@ def cases(plain):
 
 
 @pytest.fixture(scope="module")
-def chosen_in(plain, cases):
+def chosen_in(model, cases):
     """The fit of each case with the friction that it shows."""
-    return cache(lambda name: fitted_in(plain, [cases(name)[2]], friction=AUTO))
+    return cache(lambda name: fitted_in(model, [cases(name)[2]], friction=AUTO))
 
 
 def chosen(found):
@@ -90,13 +90,13 @@ def friction(true, pi, v, load):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_family_that_is_stated_is_found_within_its_intervals(plain, cases, name):
+def test_a_family_that_is_stated_is_found_within_its_intervals(model, cases, name):
     true, pi, log = cases(name)
     # least squares alone does not tell the parts of a curve from viscous friction
     estimator = helper.FIT if name == "curve" else "wls"
     # errors of shapes widen intervals when all is concluded
     finds = found_in if CASES[name][0] else fitted_in
-    found = finds(plain, [log], friction={ELBOW: name, "*": "none"}, estimator=estimator)
+    found = finds(model, [log], friction={ELBOW: name, "*": "none"}, estimator=estimator)
     (choice,) = found.drives
     assert (choice.joint, choice.families) == (ELBOW, (name,))
     for shape, size in zip(choice.shapes, CASES[name][0], strict=True):
@@ -138,33 +138,33 @@ def test_the_family_is_chosen_on_its_joint_and_nothing_on_others(chosen_in, name
     assert found.metrics().per_joint[ELBOW].relative_error_pct == pytest.approx(1.0, rel=0.15)
 
 
-def test_a_shape_between_the_sizes_of_the_grid_needs_no_second_family(plain):
+def test_a_shape_between_the_sizes_of_the_grid_needs_no_second_family(model):
     low, high = FAMILIES["stribeck"].shapes[0].within(SEEN)
     speed = low * (high / low) ** (3.5 / 5)  # of 6 sizes
     terms = [Stribeck(speed=speed)]
-    true, pi = driven(plain, {ELBOW: terms}, {f"{ELBOW}.stribeck": 6.0})
-    found = fitted_in(plain, [driven_log(true, pi, SEED, reach=QUANTILE)], estimator="wls")
+    true, pi = driven(model, {ELBOW: terms}, {f"{ELBOW}.stribeck": 6.0})
+    found = fitted_in(model, [driven_log(true, pi, SEED, reach=QUANTILE)], estimator="wls")
     assert chosen(found) == {ELBOW: ("stribeck",)}
 
 
-def test_a_robot_of_viscous_and_coulomb_friction_gets_no_more(plain):
-    true, pi = driven(plain, {}, {})
+def test_a_robot_of_viscous_and_coulomb_friction_gets_no_more(model):
+    true, pi = driven(model, {}, {})
     for seed in range(2):
-        found = fitted_in(plain, [driven_log(true, pi, seed, reach=QUANTILE, noise=0.02)])
+        found = fitted_in(model, [driven_log(true, pi, seed, reach=QUANTILE, noise=0.02)])
         assert [c.joint for c in found.drives] == list(JOINTS)
         assert chosen(found) == {}
-        assert found.model.layout == plain.layout
+        assert found.model.layout == model.layout
 
 
 @pytest.fixture(scope="module")
-def rising(plain):
+def rising(model):
     """Friction that sets in over most of the speeds: a hook of Stribeck's fits nearly as well."""
     terms = [Tanh(speed=0.6 * SEEN["v"][1])]
-    true, pi = driven(plain, {ELBOW: terms}, {f"{ELBOW}.tanh": 14.0})
-    return helper.found_in(plain, [driven_log(true, pi, SEED, reach=QUANTILE, noise=0.03)])
+    true, pi = driven(model, {ELBOW: terms}, {f"{ELBOW}.tanh": 14.0})
+    return helper.found_in(model, [driven_log(true, pi, SEED, reach=QUANTILE, noise=0.03)])
 
 
-def test_of_families_alike_the_better_conditioned_is_chosen(plain, rising):
+def test_of_families_alike_the_better_conditioned_is_chosen(model, rising):
     assert chosen(rising) == {ELBOW: ("tanh",)}
     (choice,) = (c for c in rising.drives if c.families)
     last = {x.families[-1]: x for x in choice.tried if len(x.families) == 1}
@@ -177,7 +177,7 @@ def test_of_families_alike_the_better_conditioned_is_chosen(plain, rising):
     assert last["stribeck"].p_value < 0.015
     assert not any(shape.is_at_bound for shape in choice.shapes)
     logs = [evaluation.recording.log for evaluation in rising.fitted]
-    stated = helper.found_in(plain, logs, friction={ELBOW: "stribeck", "*": "none"})
+    stated = helper.found_in(model, logs, friction={ELBOW: "stribeck", "*": "none"})
     (other,) = (c for c in stated.drives if c.families)
     assert other.shapes[0].is_at_bound
     (said,) = [f for f in stated.findings if f.code == "correlated_terms"]
@@ -192,41 +192,41 @@ def test_of_families_alike_the_better_conditioned_is_chosen(plain, rising):
     assert said.evidence["r"] == pytest.approx(C[i, k] / np.sqrt(C[i, i] * C[k, k]))
 
 
-def test_harmonics_are_for_joints_that_turn_far_enough(plain):
+def test_harmonics_are_for_joints_that_turn_far_enough(model):
     waves = [Harmonic(order=2.0), Harmonic(order=2.0, is_sine=True)]
-    true, pi = driven(plain, {ELBOW: waves}, {f"{ELBOW}.cos2": 2.0, f"{ELBOW}.sin2": 1.5})
+    true, pi = driven(model, {ELBOW: waves}, {f"{ELBOW}.cos2": 2.0, f"{ELBOW}.sin2": 1.5})
     log = driven_log(true, pi, SEED, reach=1.0)  # 2.4 rad
-    found = fitted_in(plain, [log])
+    found = fitted_in(model, [log])
     names = {family for families in chosen(found).values() for family in families}
     assert not names & {"harmonics2", "harmonics4"}
     assert not any("harmonics" in f for c in found.drives for x in c.tried for f in x.families)
     with pytest.raises(SettingsError, match=r"elbow_joint has harmonics4, .* half a revolution"):
-        fitted_in(plain, [log], friction={ELBOW: "harmonics4"})
+        fitted_in(model, [log], friction={ELBOW: "harmonics4"})
 
 
 @pytest.mark.parametrize("load", [-0.05, 0.7])
-def test_friction_that_would_be_negative_or_hold_any_load_is_none(plain, load):
-    true, pi = driven(plain, {ELBOW: [LoadFriction()]}, {f"{ELBOW}.load": load})
-    found = fitted_in(plain, [driven_log(true, pi, SEED, reach=QUANTILE)])
+def test_friction_that_would_be_negative_or_hold_any_load_is_none(model, load):
+    true, pi = driven(model, {ELBOW: [LoadFriction()]}, {f"{ELBOW}.load": load})
+    found = fitted_in(model, [driven_log(true, pi, SEED, reach=QUANTILE)])
     assert "load" not in chosen(found).get(ELBOW, ())
     assert ("load",) not in {x.families for x in found.drives[1].tried}
 
 
-def test_what_is_nearly_chosen_widens_the_intervals_it_would_move(plain):
+def test_what_is_nearly_chosen_widens_the_intervals_it_would_move(model):
     """Load friction lost in the noise of one joint: its Coulomb friction takes a part of it."""
-    true, pi = driven(plain, {ELBOW: [LoadFriction()]}, {f"{ELBOW}.load": 0.03})
-    k = list(plain.layout.names).index(f"{ELBOW}.coulomb")
+    true, pi = driven(model, {ELBOW: [LoadFriction()]}, {f"{ELBOW}.load": 0.03})
+    k = list(model.layout.names).index(f"{ELBOW}.coulomb")
     coulomb = pi[list(true.layout.names).index(f"{ELBOW}.coulomb")]
     seen = 0
     for seed in range(3):
         log = driven_log(true, pi, seed, reach=QUANTILE, noise=0.06)
-        found = found_in(plain, [log], estimator="wls")
+        found = found_in(model, [log], estimator="wls")
         (choice,) = (c for c in found.drives if c.joint == ELBOW)
         assert all(x.p_value < 0.015 for x in choice.tried if x.is_selected and x.families)
         if choice.families or [t.name for t in choice.undecided] != ["load"]:
             continue
         seen += 1
-        alone = found_in(plain, [log], friction="none", estimator="wls")
+        alone = found_in(model, [log], friction="none", estimator="wls")
         assert found.standard[k] == alone.standard[k]
         assert found.standard_error[k] > alone.standard_error[k]
         assert abs(found.standard[k] - coulomb) < SURE * found.standard_error[k]

@@ -23,22 +23,22 @@ PLAIN = "viscous+coulomb"
 
 
 @pytest.fixture(scope="module")
-def loaded(plain):
+def loaded(model):
     """A robot whose elbow has load friction, its parameters by name, and its log."""
-    true, pi = driven(plain, {ELBOW: [LoadFriction()]}, {f"{ELBOW}.load": 0.1})
+    true, pi = driven(model, {ELBOW: [LoadFriction()]}, {f"{ELBOW}.load": 0.1})
     names = dict(zip(true.layout.names, pi, strict=True))
     return names, driven_log(true, pi, 3, reach=QUANTILE)
 
 
 @pytest.fixture(scope="module")
-def hooked(plain):
-    true, pi = driven(plain, {ELBOW: [Stribeck(speed=0.1)]}, {f"{ELBOW}.stribeck": 3.0})
+def hooked(model):
+    true, pi = driven(model, {ELBOW: [Stribeck(speed=0.1)]}, {f"{ELBOW}.stribeck": 3.0})
     names = dict(zip(true.layout.names, pi, strict=True))
     return names, driven_log(true, pi, 3, reach=QUANTILE)
 
 
 @pytest.fixture(scope="module")
-def fits(plain, request):
+def fits(model, request):
     """Fits of these robots by name and friction, each made when it is first asked for."""
     made = {}
 
@@ -48,7 +48,7 @@ def fits(plain, request):
             _, log = request.getfixturevalue(robot)
             slower = replace(log, t=1.4 * log.t, v=None, a=None)  # at other speeds, other loads
             made[key] = found_in(
-                plain, [log], validation=[slower], friction=friction, estimator="wls"
+                model, [log], validation=[slower], friction=friction, estimator="wls"
             )
         return made[key]
 
@@ -95,10 +95,10 @@ def test_what_a_misfit_moves_is_what_a_fit_with_the_term_finds(fits):
 
 @pytest.mark.parametrize(("robot", "family"), [("loaded", "load"), ("hooked", "stribeck")])
 def test_a_prediction_errs_by_what_a_missing_term_moves_and_by_its_torque(
-    plain, robot, family, fits
+    model, robot, family, fits
 ):
     """The oracle: how much the prediction changes once the term is in the model."""
-    joint = plain.joints.index(ELBOW)
+    joint = model.joints.index(ELBOW)
     found, better = (fits(robot, x) for x in (PLAIN, {ELBOW: family, "*": "none"}))
     (term,) = (term for term in found.open_terms if term.joint == ELBOW)
     pure = found.standard_covariance - sum(np.outer(x.moves, x.moves) for x in found.open_terms)
@@ -125,7 +125,7 @@ def test_a_prediction_errs_by_what_a_missing_term_moves_and_by_its_torque(
     np.testing.assert_allclose(curves[0].std, np.abs(changed), atol=0.3 * np.abs(changed).max())
 
 
-def test_an_error_of_a_shape_moves_parameters_as_refits_do(plain, hooked, fits):
+def test_an_error_of_a_shape_moves_parameters_as_refits_do(model, hooked, fits):
     """The oracle: fits with the shape stated, larger and smaller by its standard error."""
     true, log = hooked
     found = fits("hooked", {ELBOW: "stribeck", "*": "none"})
@@ -135,8 +135,8 @@ def test_an_error_of_a_shape_moves_parameters_as_refits_do(plain, hooked, fits):
     for size in (shape.value - shape.std_error, shape.value, shape.value + shape.std_error):
         (term,) = choice.terms
         own = Stribeck(speed=size, data_range=term.data_range)
-        model = plain.with_terms({ELBOW: [own]})
-        sure[size] = found_in(model, [log], friction="none", estimator="wls")
+        known = model.with_terms({ELBOW: [own]})
+        sure[size] = found_in(known, [log], friction="none", estimator="wls")
     low, middle, high = sure.values()
     for term in ("stribeck", "coulomb", "viscous"):
         k = at(found, f"{ELBOW}.{term}")
@@ -156,10 +156,10 @@ def test_an_error_of_a_shape_moves_parameters_as_refits_do(plain, hooked, fits):
     np.testing.assert_allclose(friction_curve(found, ELBOW, v).std, wanted, rtol=0.05)
 
 
-def test_a_clean_robot_has_the_errors_of_its_noise(plain):
-    true, pi = driven(plain, {}, {})
+def test_a_clean_robot_has_the_errors_of_its_noise(model):
+    true, pi = driven(model, {}, {})
     found = found_in(
-        plain, [driven_log(true, pi, 3, reach=QUANTILE)], friction=PLAIN, estimator="wls"
+        model, [driven_log(true, pi, 3, reach=QUANTILE)], friction=PLAIN, estimator="wls"
     )
     assert find_misfits(take_sample(found)) == found.misfits == ()
     np.testing.assert_allclose(found.base_error, found.wls.std_error)

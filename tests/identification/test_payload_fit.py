@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.driven import arm
 from helpers.synthetic import exact_log, truth
 from scipy.stats import t as t_of
 
@@ -250,8 +249,7 @@ def test_what_cannot_be_asked_is_refused_by_name(ur5, rng):
     assert nothing.determined == ("mass",)
 
 
-def test_friction_of_currents_is_chosen_on_the_torques_that_the_gains_make(rng):
-    model = arm()
+def test_friction_of_currents_is_chosen_on_the_torques_that_the_gains_make(model, rng):
     log, without = recorded(model, rng, samples=500)
     pi = truth(model) * (np.arange(len(model.layout.names)) < model.layout.n_inertial)
 

@@ -165,17 +165,18 @@ def test_one_more_log_narrows_the_next_interval_by_a_share_of_its_width():
 def test_a_reason_of_a_joint_is_shown_once():
     verdict = {
         "status": "poor",
-        "reasons": ["a: bad", "c: slow", "a: slow", "no log"],
+        "reasons": ["a: bad", "c, a: slow", "e, f: cold", "no log"],
         "per_joint": {
             "a": {"status": "poor", "reasons": ["a: bad", "a: slow"]},
             "b": {"status": "good", "reasons": ["error 3 %"]},
             "c": {"status": "usable", "reasons": ["c: slow"]},
             "d": {"status": "good", "reasons": ["error 4 %"]},
+            **{name: {"status": "poor", "reasons": ["e, f: cold"]} for name in "ef"},
         },
     }
     assert verdict_lines(verdict) == [
-        "verdict: poor", "  a: poor, bad", "  c: usable, slow", "  - a: slow", "  - no log",
-        "  b, d: good",
+        "verdict: poor", "  a: poor, bad", "  - c, a: slow", "  e, f: poor, cold", "  - no log",
+        "  b, d: good", "  c: usable, slow",
     ]  # fmt: skip
     alone = {"status": "good", "reasons": ["fine"], "per_joint": {"b": verdict["per_joint"]["b"]}}
     assert verdict_lines(alone) == ["verdict: good", "  - fine"]

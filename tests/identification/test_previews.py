@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.signal
-from helpers.driven import arm
 from helpers.fitting import identify
 from helpers.synthetic import truth
 
@@ -90,8 +89,7 @@ def test_the_errors_expected_are_the_scatter_of_many_recordings(ur5, motion, col
     assert ratio.max() < 1.6
 
 
-def test_motions_of_two_lengths_and_filters_tell_as_much_as_their_rows(rng):
-    model = arm()
+def test_motions_of_two_lengths_and_filters_tell_as_much_as_their_rows(model, rng):
     mapping = structural_mapping(model)
     logs = [moved(model, rng, period=period)[0] for period in (12.0, 7.0)]
     settings = SignalSettings(cutoff=5.0), SignalSettings(cutoff=20.0)
@@ -191,8 +189,7 @@ def test_noise_is_stated_or_a_hundredth_of_the_largest_torque(ur5):
         assumed_noise(ur5, size, {}, -1.0)
 
 
-def test_assumed_friction_is_a_twentieth_of_the_torque_at_the_speed_of_each_joint():
-    model = arm()
+def test_assumed_friction_is_a_twentieth_of_the_torque_at_the_speed_of_each_joint(model):
     unlimited = tuple(replace(joint, velocity=np.inf) for joint in model.tree.joints)
     model = replace(model, tree=replace(model.tree, joints=unlimited))
     pi = dict(zip(model.layout.names, assumed_parameters(model, STD[:3], STD[3:]), strict=True))

@@ -43,6 +43,7 @@ _NO_MEANING = {"measured", "meas", "actual", "act", "state", "states", "field", 
                "joints", "observation", "rad", "deg", "nm"}  # fmt: skip
 _CLOCKS = {("time",), ("t",), ("timestamp",), ("stamp",), ("header", "stamp")}
 _NAME = re.compile(r"(.*?)name(\W*\d+\W*)")  # of a joint, in each row: field.name0
+_UNIT = re.compile(r"\s*[\[(](m?rad|deg|m?m|k?N ?m?|m?A)(/s(\^?2)?)?[\])]$")  # behind a name
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+|[^\W\d_]+")
 
 
@@ -122,6 +123,7 @@ def quantity_of(
     name: str, effort: str = "torque", joints: Iterable[str] = ()
 ) -> tuple[str, str] | None:
     """Return quantity and joint of a column, or None: "q_des_elbow" is qref of elbow."""
+    name = _UNIT.sub("", name)
     for joint, rest in _around(name, sorted(joints, key=len, reverse=True)):
         if kind := _kind(rest, effort):
             return kind, joint
@@ -154,8 +156,9 @@ def is_quantity(name: str) -> bool:
 
 
 def is_clock(name: str) -> bool:
-    """Return whether a column has time stamps: time, t, timestamp, stamp, header.stamp."""
-    return tuple(word for word in _words(name) if word not in _NO_MEANING) in _CLOCKS
+    """Return whether a column has time stamps: time, t, timestamp, stamp, header.stamp, t [s]."""
+    words = [word for word in _words(name) if word not in _NO_MEANING]
+    return tuple(words) in _CLOCKS or clock_unit(name) == "s"
 
 
 def clock_unit(name: str) -> str | None:
@@ -513,7 +516,7 @@ class Finder:
 
     def _clocks(self) -> list[str]:
         """Return the columns with time stamps: "time" or "t", else that of the measurement."""
-        clocks = [name for name in self.names if is_clock(name)]
+        clocks = [x for x in self.names if is_clock(x) or clock_unit(x) == (self.units.time or "s")]
         plain = [name for name in clocks if name in ("time", "t")]
         return plain or [name for name in clocks if "header" in name.lower()] or clocks
 
@@ -624,10 +627,7 @@ class Finder:
         if not absent:
             return "Without time stamps, give the rate of the rows [Hz]: log = { rate = 100 }"
         if at_motors := [name for name in self.names if name.startswith(("qm_", "taum_"))]:
-            return (
-                f"For columns of motors, as {at_motors[0]}, add [[transmission]] with joints "
-                "and matrix"
-            )
+            return f"For columns of motors, as {at_motors[0]}, add [[transmission]], with a matrix"
         kind, joints = absent[0][0], [joint for _, joint in absent]
         if kind == "tau" and not any(map(self.has_torque, self.joints)):
             return without_torque(all(self.has("qref", other) for other in self.joints))

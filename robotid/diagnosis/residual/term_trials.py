@@ -283,9 +283,9 @@ def cut_segments(sizes: Sequence[int], independent: float) -> tuple[slice, ...]:
     return tuple(slice(*pair) for pair in pairwise(edges))
 
 
-def regressor(model: RobotModel, motion: Trajectory, samples: Array | None = None) -> Array:
+def regressor(model: RobotModel, motion: Trajectory, rows: Array | slice = slice(None)) -> Array:
     """Return the regressor of the standard parameters at some samples, shape (N, n, p)."""
-    Y = trajectory_regressor(model, motion, samples)
+    Y = trajectory_regressor(model, motion, rows)
     return Y.reshape(-1, model.n_rows, Y.shape[1])
 
 

@@ -409,11 +409,12 @@ def concluded(
     joints: Mapping[str, JointVerdict], *, poor: Sequence[str], warnings: Sequence[str], good: str,
     notes: Sequence[str] = (), log_errors: Sequence[str] = (), is_tested: bool = True,
 ) -> Verdict:  # fmt: skip
-    """Return the verdict that follows from reasons."""
+    """Return the verdict that follows from reasons; the same words about joints are one reason."""
     status = "usable" if warnings else "good"
     status = "poor" if poor or log_errors else status if is_tested else "not evaluated"
-    reasons = (*log_errors, *poor, *warnings) or (good,)
-    return Verdict(status, (*reasons, *notes), joints, tuple(log_errors))
+    parts = [(*x.partition(": "), x) for x in (*log_errors, *poor, *warnings)]
+    reasons = _shared((name, words) if name in joints else ("", x) for name, _, words, x in parts)
+    return Verdict(status, (*(reasons or [good]), *notes), joints, tuple(log_errors))
 
 
 def on_joint(
@@ -504,12 +505,17 @@ def is_downweighted(finding: Finding) -> bool:
 
 def _described(warnings: Sequence[VerdictWarning]) -> list[str]:
     """Return one sentence per kind of warning, with the joints that share it."""
-    shared: dict[tuple[str, str], list[str]] = {}
-    for warning in warnings:
-        shared.setdefault((warning.message, warning.code), []).append(warning.joint)
+    return _shared((warning.joint, f"{warning.message} ({warning.code})") for warning in warnings)
+
+
+def _shared(reasons: Iterable[tuple[str, str]]) -> list[str]:
+    """Return sentences, with the joints (or "") that share their words before them."""
+    shared: dict[str, list[str]] = {}
+    for joint, words in reasons:
+        shared.setdefault(words, []).append(joint)
     return [
-        f"{', '.join(joints)}: {message} ({code})" if any(joints) else f"{message} ({code})"
-        for (message, code), joints in shared.items()
+        f"{', '.join(joints)}: {words}" if any(joints) else words
+        for words, joints in shared.items()
     ]
 
 

@@ -26,7 +26,7 @@ from robotid.dynamics.simulation.simulation_settings import (
     by_joint,
 )
 from robotid.dynamics.torque import bodies_torque, predict, remember
-from robotid.robot.bodies import link_transfer
+from robotid.robot.bodies import link_transfer, parameters_about
 from robotid.robot.drive_term import DIRECTED, LOADED, PLAIN, MemorylessTerm
 from robotid.robot.drives import Bristles, Lag
 from robotid.robot.mass_matrix import drive_inertia, rigid_mass_matrices
@@ -105,20 +105,20 @@ def follow(
     _check_size(duration * rate, 1)
     t = np.arange(round(duration * rate) + 1) / rate
     loaded = carried(model, pi, settings.payload)
-    deflection = settings.payload.start if settings.payload.mass > 0 else math.inf
+    attached = settings.payload.start if settings.payload.mass > 0 else math.inf  # [s]
     model.require_fixed("simulation")
     if settings.controller.kind == "perfect":
-        return _perfect(model, pi, loaded, motion, t, deflection)
+        return _perfect(model, pi, loaded, motion, t, attached)
     loops = [_Loop(model, x, settings) for x in (pi, loaded)]
     steps = max(1, math.ceil(1.0 / rate / min(loop.longest_step for loop in loops) - 1e-9))
     _check_size(len(t), steps)
     h = 1.0 / rate / steps
-    loop, *later = loops if deflection > 0 else loops[1:]
+    loop, *later = loops if attached > 0 else loops[1:]
     measured = np.empty((len(t), 4, len(model.joints)))
     reference, limited = np.empty_like(measured[:, 0]), np.zeros(len(model.joints))
     y = np.empty(0)
     for k, wanted in enumerate(_wanted(loop.controller, motion, len(t), steps, h)):
-        if later and t[k] >= deflection - 1e-9 / rate:
+        if later and t[k] >= attached - 1e-9 / rate:
             loop = later.pop()
         y = y if k else loop.start(*wanted[0, 0, :3])
         F = loop.friction(y)
@@ -142,7 +142,7 @@ def follow(
 
 
 def _check_size(samples: float, steps: int) -> None:
-    """Refuse simulations with too many steps for an hour of computation."""
+    """Refuse simulations with too many steps for half an hour of computation."""
     if samples * steps > _MOST or steps > _MOST_EACH:
         raise SettingsError(
             f"the simulation has {samples:.3g} samples of {steps} steps each, expected at most "
@@ -173,13 +173,10 @@ def carried(model: RobotModel, pi: Array, payload: Payload) -> Array:
     body, transfer = link_transfer(model, link)
     if body < 0:
         raise SettingsError(f"payload: link {link!r} is fixed to the world. Name a moving link")
-    m, c = payload.mass, np.array(payload.com)
     xx, xy, yy, xz, yz, zz = payload.inertia
     central = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    about_link = central + m * (c @ c * np.eye(3) - np.outer(c, c))
-    (xx, xy, xz), (_, yy, yz), (_, _, zz) = about_link.tolist()
-    added = np.array([m, *(m * c), xx, xy, yy, xz, yz, zz])
-    if np.linalg.eigvalsh(pseudo_inertia(added)[0])[0] < -1e-9 * m:
+    added = parameters_about(payload.mass, np.array(payload.com), central)
+    if np.linalg.eigvalsh(pseudo_inertia(added)[0])[0] < -1e-9 * payload.mass:
         raise SettingsError(
             f"payload: inertia is {list(payload.inertia)}, which is physically inconsistent. Each "
             "principal moment must be 0 or more, and at most the sum of the other two"
@@ -190,7 +187,7 @@ def carried(model: RobotModel, pi: Array, payload: Payload) -> Array:
 
 
 def _perfect(
-    model: RobotModel, pi: Array, loaded: Array, motion: Motion, t: Array, deflection: float
+    model: RobotModel, pi: Array, loaded: Array, motion: Motion, t: Array, attached: float
 ) -> Run:
     """Return the run of a robot that tracks exactly, by inverse dynamics."""
     q, v, a = motion.evaluate(t)
@@ -200,7 +197,7 @@ def _perfect(
     for x in [pi] if loaded is pi else [pi, loaded]:
         robot = model.with_reference(x)
         torques += predict(robot, [x], remember(robot, rows))
-    tau = np.where((t >= deflection)[:, None], torques[-1], torques[0])
+    tau = np.where((t >= attached)[:, None], torques[-1], torques[0])
     return Run(t, q, v, a, tau, q, np.zeros(len(model.joints)))
 
 
@@ -698,10 +695,8 @@ def another_robot(model: RobotModel, rng: np.random.Generator) -> Array:
     by_body = pi[:size].reshape(-1, 10)
     change = rng.uniform(0.1, 0.3, len(by_body)) * rng.choice([-1, 1], len(by_body))
     by_body *= 1 + change[:, None]
-    mass, arm = 1.2, 0.1  # [kg], [m]
-    tool = [mass, 0.0, mass * arm, 0.0, mass * arm**2, 0.0, 0.0, 0.0, 0.0, mass * arm**2]
-    by_body[-1] += tool
-    by_body[-1] += [0, 0, 0, 0, 1e-3, 0, 1e-3, 0, 0, 1e-3]  # a tool has an extent
+    tool = 1.2, np.array([0.0, 0.1, 0.0]), 1e-3 * np.eye(3)  # [kg], [m], [kg m^2]
+    by_body[-1] += parameters_about(*tool)
     for i, (_, term) in enumerate(model.layout.drive_parameters, start=size):
         pi[i] = rng.uniform(*term.typical)
     return pi

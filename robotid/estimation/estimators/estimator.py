@@ -67,8 +67,7 @@ class Estimate:
     def std_error(self) -> Array:
         """Standard error of each parameter, shape (c,); inf if not identifiable."""
         # noise-free data give a variance of rounding size, of either sign
-        errors: Array = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-        return errors
+        return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
 
     @property
     def quantile(self) -> Array:
@@ -91,9 +90,10 @@ class Estimator(ABC, Generic[DataT]):
     def fit(self, data: DataT) -> Estimate:
         """Estimate the parameters from a problem in base parameters, its factors or a simulator.
 
-        Raises:     DataError: If there are fewer rows than parameters, or a row cannot be used.
-        RankDeficientError: If parameters are not identifiable and there is no prior.
-        NotConvergedError: If an iteration or a solver does not converge.
+        Raises:
+            DataError: If there are fewer rows than parameters, or a row cannot be used.
+            RankDeficientError: If parameters are not identifiable and there is no prior.
+            NotConvergedError: If an iteration or a solver does not converge.
         """
 
 

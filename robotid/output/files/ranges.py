@@ -163,8 +163,8 @@ def _body(pi: Array, covariance: Array, sources: Sequence[str], quantile: float)
     D = np.vstack([np.eye(10)[:1], d_com, d_moments, d_inertia])  # (10, 10), d values / d pi
     errors = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", D, covariance, D), 0.0))
     errors = errors if covariance.any() else np.full(len(errors), math.inf)
-    origins = [sources[0], *(_joint_source([sources[0], sources[k]]) for k in (1, 2, 3))]
-    origins += [_joint_source(sources)] * 6
+    parts = [sources[:1], *([sources[0], source] for source in sources[1:4]), *[sources] * 6]
+    origins = [part[0] if len(set(part)) == 1 else "mixed" for part in parts]
     x, y, z, w = Rotation.from_matrix(V).as_quat()
     mass, *rest = (
         _range(value, error, origin, quantile, is_positive=not 1 <= k <= 3)
@@ -177,10 +177,6 @@ def _body(pi: Array, covariance: Array, sources: Sequence[str], quantile: float)
         "second_moments": dict(zip("xyz", rest[3:6], strict=True)),
         "principal_moments": dict(zip(("Ixx", "Iyy", "Izz"), rest[6:], strict=True)),
     }
-
-
-def _joint_source(sources: Sequence[str]) -> str:
-    return sources[0] if len(set(sources)) == 1 else "mixed"
 
 
 def _range(
@@ -282,6 +278,9 @@ def sample(result: Result, count: int, rng: np.random.Generator) -> tuple[list[s
         minors = [np.linalg.det(J[:, :k, :k]) > 0.0 for k in (1, 2, 3, 4)]  # Sylvester
         return np.asarray(signs & np.all(minors, axis=0).reshape(len(x), -1).all(1))
 
+    if not is_possible(np.zeros((1, len(nominal)))).all():
+        found = "kp or limit is 0, or a body is at its bound; state that value and identify again"
+        raise DataError(f"{result.path.name}: no samples about an impossible estimate: {found}")
     x = possible_draws(root, is_possible, count, rng)
     drawn = nominal + x
     if varies.any():

@@ -155,13 +155,13 @@ def _expected(preview: Preview) -> str:
     order = np.argsort(-ratio, kind="stable")[:_NAMED]
     names = found.mapping.base_names
     least = [f"{names[k]} {100 * ratio[k]:.0f} %" for k in order if ratio[k] > _OPEN]
-    stds = [f"{joint} {s:.2g}" for joint, s in zip(found.model.joints, noise.std, strict=True)]
+    rows = zip(found.model.joints, noise.std, found.model.row_units, strict=True)
+    stds = [f"{joint} {std:.2g} {unit}" for joint, std, unit in rows]
     sentences = [
         f"{preview.words}.",
         f"Of {len(ratio)} base parameters, {int((ratio < _SHARP).sum())} have an expected standard "
         f"error below 10 % of their plausible range, {int((ratio > _OPEN).sum())} above 50 %.",
         f"Largest, in % of the plausible range: {', '.join(least)}." if least else "",
-        f"Standard deviation of the torque noise, {listed(dict.fromkeys(noise.origins))}: "
-        f"{', '.join(stds)} (N m or N).",
+        f"Torque noise, {listed(dict.fromkeys(noise.origins))}, RMS: {', '.join(stds)}.",
     ]
     return paragraphs(sentences)

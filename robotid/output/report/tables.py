@@ -151,7 +151,8 @@ def error_bars(
     alone = f" on {recordings[0].name}" * (len(recordings) == 1 and not recordings[0].is_fitted)
     items, said = list[str](), set[str]()
     for joint in [*worst, *(joint for joint in verdicts if joint not in worst)]:
-        verdict, row, link, picture = verdicts.get(joint, _UNKNOWN), rows.index(joint), "", ""
+        verdict, row, link = verdicts.get(joint, _UNKNOWN), rows.index(joint), ""
+        figure = picture = ""
         status = verdict["status"]
         reasons = [reason.replace(alone, "") for reason in verdict["reasons"]]
         shown = reasons if status != "good" else [] if items else reasons[-1:]
@@ -159,13 +160,14 @@ def error_bars(
         why, said = "as above" if why and why in said else why, said | {why}
         error = _share(worst[joint]) if joint in worst else None
         if error is not None:
+            figure = f"{percent(error).html} %"
             picture = _picture(quantity, row, joint, error, worst[joint])
             if has_why and why:  # else the link would stand alone on a line
                 link = block("report.analysis", row=row, joint=escape(joint))
         items.append(
             block(
                 "report.bar", kind=status.replace(" ", "-"), row=row, joint=code(joint).html,
-                picture=picture, error=percent(error).html, status=status, why=escape(why) + link,
+                picture=picture, error=figure, status=status, why=escape(why) + link,
             )
         )  # fmt: skip
     more = "".join(items[VISIBLE:])

@@ -94,11 +94,7 @@ def ellipsoid(J: Array) -> dict[str, Any]:
 
     The second moments about the centre of mass, Sigma_c = Sigma - m c c', are those of a solid
     ellipsoid of uniform density whose semi-axes have the lengths sqrt(5 s_i / m), s_i the
-    eigenvalues of Sigma_c.
-
-    References:
-        Wensing, Kim, Slotine (2018), Linear matrix inequalities for physically consistent
-        inertial parameter identification, section IV.
+    eigenvalues of Sigma_c (Wensing, Kim, Slotine 2018, section IV).
     """
     m, place = float(J[3, 3]), {"com": None, "semi_axes": None, "quaternion": [0.0, 0.0, 0.0, 1.0]}
     if not m > 0:
@@ -300,10 +296,8 @@ def thin(solids: Sequence[Sequence[Surface]], most: int) -> list[list[Surface]]:
 
     fast-simplification collapses edges in the order of the change of shape; a collapsed edge opens
     no hole. The triangles of a surface have one orientation, outwards if it is closed. Each side of
-    a sharp edge has its own corners.
-
-    References:
-        Garland, Heckbert (1997), Surface simplification using quadric error metrics.
+    a sharp edge has its own corners. Garland, Heckbert (1997), Surface simplification using quadric
+    error metrics.
     """
     share = most / max(sum(len(patch.faces) for solid in solids for patch in solid), 1)
     return [_thinned_solid(solid, share) if solid else [] for solid in solids]

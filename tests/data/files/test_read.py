@@ -72,7 +72,7 @@ SPELLINGS = [
     ("actual_q_{}", "actual_qd_{}", "measured_torque_{}", "{}_desired_position"),
     ("observation.state.{}.pos", "observation.{}.vel", "observation.{}.torque", "action.{}.pos"),
 ]
-CLOCKS = ["timestamp", "t", "stamp", "%time", "Time", "header.stamp", "time"]
+CLOCKS = ["timestamp", "t", "stamp", "%time", "Time [s]", "header.stamp", "time"]
 
 
 @pytest.mark.parametrize(("words", "clock"), list(zip(SPELLINGS, CLOCKS, strict=True)))
@@ -89,14 +89,14 @@ def test_words_of_a_quantity_stand_before_or_after_the_joint(words, clock):
     np.testing.assert_allclose(commanded.q_ref[0], [1.3, 1.7])
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["q{}", "q_{}", "q[{}]", "joint{}_pos", "J{}.position", "field.position{}", "arm.j{} angle"],
-)
+NUMBERED = "q{},q_{},q[{}],q{} [rad],joint{}_pos,J{}.position,field.position{},arm.j{} angle"
+
+
+@pytest.mark.parametrize("name", NUMBERED.split(","))
 @pytest.mark.parametrize("first", [0, 4])
 def test_consecutive_numbers_are_read_by_order_and_this_is_said(name, first):
     numbers = [first + k for k in (2, 0, 1)]  # in any order of the file
-    names = [*(name.format(k) for k in numbers), *(f"tau{k}" for k in numbers)]
+    names = [*(name.format(k) for k in numbers), *(f"tau{k} (N m)" for k in numbers)]
     table = pd.DataFrame({"time": T, **{x: ONE * k for k, x in enumerate(names)}})
     for joints in (("joint7", "joint8", "joint9"), ("c", "b", "a")):
         log = read_log(table, joints)

@@ -275,8 +275,7 @@ def test_any_total_mass_of_a_fixed_arm_fits_and_none_verifies(lifted, times):
     assert "Verify it with a payload of known mass (robotid payload)" in found.message
 
 
-def test_the_named_links_take_up_most_of_the_likeliest_change_that_no_torque_shows():
-    model = arm()
+def test_the_named_links_take_up_most_of_the_likeliest_change_that_no_torque_shows(model):
     layout, K = model.layout, structural_mapping(model).K
     spread = np.full(len(layout.names), 0.2)
     spread[: layout.n_inertial : 10] = 0.9, 0.35, 1.5  # [kg]
@@ -360,8 +359,7 @@ def test_each_limit_of_a_stated_mass(ratio, half_width, verifies, contradicts):
 
 
 @pytest.mark.parametrize("mass", [0.0, -0.1])
-def test_a_fit_without_a_total_mass_does_not_determine_it(mass):
-    model = arm()
+def test_a_fit_without_a_total_mass_does_not_determine_it(model, mass):
     standard = np.ones(len(model.layout.names))  # of other parameters than masses
     standard[: model.layout.n_inertial : 10] = mass
     assert not determines_total_mass(SimpleNamespace(model=model, standard=standard))

@@ -455,7 +455,10 @@ def test_what_no_log_tests_is_not_evaluated():
     still = judged_positions({"a": 2.0})
     assert (still.status, statuses(still)) == ("usable", {"a": "good", "b": "not evaluated"})
     assert still.reasons == ("b: commanded to rest in all logs: not evaluated",)
-    assert judged_positions({}).status == "not evaluated"
+    none = judged_positions({})
+    assert none.status == "not evaluated"
+    assert none.reasons == ("a, b: commanded to rest in all logs: not evaluated",)
+    assert "  a, b: commanded to rest in all logs: not evaluated" in verdict_lines(none.to_dict())
 
 
 def test_faults_and_cautions_come_first_and_the_scale_last():

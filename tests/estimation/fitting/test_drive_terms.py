@@ -4,7 +4,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.driven import arm
 
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
@@ -60,8 +59,7 @@ def recording(model, rng, count, cutoff, start):
     return SimpleNamespace(trajectory=motion, signals=SignalSettings(cutoff=cutoff))
 
 
-def test_rows_of_two_logs_follow_each_other_with_the_time_since_each_began(rng):
-    model = arm()
+def test_rows_of_two_logs_follow_each_other_with_the_time_since_each_began(model, rng):
     logs = [recording(model, rng, *x) for x in ((40, 5.0, 3.0), (90, 8.0, 7.0))]
     rows = [np.arange(1, 40, 3), np.array([0, 7, 89])]
     load = rng.standard_normal((16, 3))

@@ -4,7 +4,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import scipy.stats
-from helpers.driven import arm
 from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
@@ -29,11 +28,6 @@ OUTLIERS = {  # [N m] by joint and row
     ("elbow_joint", 1148): 1000.0,
     ("shoulder_lift_joint", 1287): 1000.0,
 }
-
-
-@pytest.fixture(scope="module")
-def model():
-    return arm()
 
 
 @pytest.fixture(scope="module")

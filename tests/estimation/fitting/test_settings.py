@@ -33,8 +33,7 @@ def test_standard_errors_of_recursive_estimators_are_honest(rng, name):
 
 
 @pytest.mark.parametrize("name", RECURSIVE)
-def test_a_recursive_estimate_is_made_physical_on_request(rng, name):
-    model = arm()
+def test_a_recursive_estimate_is_made_physical_on_request(model, rng, name):
     log = exact_log(model, truth(model), rng, noise=20 * np.array([4.0, 2.0, 0.3]))
     free = fit(model, [log], signals=EXACT, estimator=name)
     assert not free.is_consistent

@@ -9,7 +9,6 @@ import pinocchio as pin
 import pytest
 from helpers.closed_chains import four_bar
 from helpers.corruptions import table_of
-from helpers.driven import arm
 from helpers.synthetic import truth
 
 from robotid.base.exceptions import DataError
@@ -34,21 +33,16 @@ LENGTH = 500  # rows per piece
 
 
 @pytest.fixture(scope="module")
-def robot():
-    return arm()
-
-
-@pytest.fixture(scope="module")
-def recording(robot):
+def recording(model):
     """Return a noisy log of three joints with jitter and gaps, one of them where a piece ends."""
     rng = np.random.default_rng(0)
     step = 0.01 * (1 + 0.1 * rng.uniform(-1, 1, 1999))
     step[[2 * LENGTH - 1, 1234]] = [0.5, 0.7]
     t = np.concatenate([[0.0], np.cumsum(step)])
-    q, v, a = random_fourier(robot, rng, period=7.0).evaluate(t)
-    tau = (joint_torque_regressor(robot, q, v, a) @ truth(robot)).reshape(v.shape)
+    q, v, a = random_fourier(model, rng, period=7.0).evaluate(t)
+    tau = (joint_torque_regressor(model, q, v, a) @ truth(model)).reshape(v.shape)
     noisy = {"q": q + 1e-5 * rng.standard_normal(q.shape), "v": v, "a": a}
-    return Log(t=t, tau=tau + 0.1 * rng.standard_normal(q.shape), joints=robot.joints, **noisy)
+    return Log(t=t, tau=tau + 0.1 * rng.standard_normal(q.shape), joints=model.joints, **noisy)
 
 
 def long_log(model, path, signals, *, start=None, end=None, length=LENGTH, **reading):
@@ -99,10 +93,10 @@ def assert_alike(model, path, signals, *, start=None, end=None, **reading):
     ],
     ids=str,
 )
-def test_pieces_reduce_to_what_the_whole_log_reduces_to(robot, recording, suffix, given, tmp_path):
+def test_pieces_reduce_to_what_the_whole_log_reduces_to(model, recording, suffix, given, tmp_path):
     path = tmp_path / f"run.{suffix}"
     write_log(recording, path)
-    found, _ = assert_alike(robot, path, SignalSettings(**given))
+    found, _ = assert_alike(model, path, SignalSettings(**given))
     assert len(found.pieces) == (4 if suffix != "npz" else 1)
     assert [p.name for p in found.pieces][:1] in (
         ["run.csv rows 0-500"],
@@ -114,32 +108,32 @@ def test_pieces_reduce_to_what_the_whole_log_reduces_to(robot, recording, suffix
     assert found.step == np.median(np.diff(recording.t))
 
 
-def test_a_window_of_a_file_is_cut_as_in_memory(robot, recording, tmp_path):
+def test_a_window_of_a_file_is_cut_as_in_memory(model, recording, tmp_path):
     path = tmp_path / "run.csv"
     write_log(recording, path)
-    found, whole = assert_alike(robot, path, SignalSettings(), start=3.3, end=12.01)
+    found, whole = assert_alike(model, path, SignalSettings(), start=3.3, end=12.01)
     np.testing.assert_array_equal(found.stamps[found.first : found.stop], whole.stamps)
     with pytest.raises(DataError) as in_memory:
-        read_log(path, robot.joints, start=50.0, end=60.0)
+        read_log(path, model.joints, start=50.0, end=60.0)
     with pytest.raises(DataError) as in_pieces:
-        long_log(robot, path, SignalSettings(), start=50.0, end=60.0)
+        long_log(model, path, SignalSettings(), start=50.0, end=60.0)
     assert str(in_pieces.value) == str(in_memory.value)
 
 
-def test_units_and_gains_are_read_as_in_memory(robot, recording, tmp_path):
+def test_units_and_gains_are_read_as_in_memory(model, recording, tmp_path):
     columns = {"time": 1e3 * recording.t}
-    for j, joint in enumerate(robot.joints):
+    for j, joint in enumerate(model.joints):
         columns[f"q_{joint}"] = np.rad2deg(recording.q[:, j])
         columns[f"dq_{joint}"] = np.rad2deg(recording.v[:, j])
         columns[f"current_{joint}"] = recording.tau[:, j] / (j + 2.0)
     path = tmp_path / "run.parquet"
     write_columns(columns, path)
-    gains = {joint: j + 2.0 for j, joint in enumerate(robot.joints)}
-    assert_alike(robot, path, SignalSettings(), gains=gains, units=LogUnits("ms", "deg"))
+    gains = {joint: j + 2.0 for j, joint in enumerate(model.joints)}
+    assert_alike(model, path, SignalSettings(), gains=gains, units=LogUnits("ms", "deg"))
     with pytest.raises(DataError, match="milliseconds"):
-        long_log(robot, path, SignalSettings(), gains=gains, units=LogUnits(None, "deg"))
+        long_log(model, path, SignalSettings(), gains=gains, units=LogUnits(None, "deg"))
     with pytest.raises(DataError, match=r"q_.* looks like degrees"):
-        long_log(robot, path, SignalSettings(), gains=gains, units=LogUnits("ms"))
+        long_log(model, path, SignalSettings(), gains=gains, units=LogUnits("ms"))
 
 
 def test_full_turns_are_taken_out_of_each_piece(tmp_path):
@@ -162,29 +156,29 @@ def test_full_turns_are_taken_out_of_each_piece(tmp_path):
     assert np.any(turned, axis=0).tolist() == free.tolist()
 
 
-def test_a_locked_joint_has_the_positions_of_all_windows(robot, recording, tmp_path, monkeypatch):
+def test_a_locked_joint_has_the_positions_of_all_windows(model, recording, tmp_path, monkeypatch):
     monkeypatch.setattr(survey, "WINDOW", 100)
     path = tmp_path / "run.csv"
     write_log(recording, path)
-    held, *moving = robot.joints
-    model = RobotModel.from_urdf(robot.tree.path, joints=moving, locked={held: 0.0})
-    reading = {"robot": model.tree.movable}
-    found = long_log(model, path, SignalSettings(), **reading).locked
+    held, *moving = model.joints
+    part = RobotModel.from_urdf(model.tree.path, joints=moving, locked={held: 0.0})
+    reading = {"robot": part.tree.movable}
+    found = long_log(part, path, SignalSettings(), **reading).locked
     rows = np.r_[0:100, 950:1050, 1900:2000]
     np.testing.assert_allclose(found[held], recording.q[rows, 0], rtol=1e-12)
 
 
 def test_a_hole_in_the_last_piece_is_named_by_its_row_in_the_file(
-    robot, recording, tmp_path, monkeypatch
+    model, recording, tmp_path, monkeypatch
 ):
     table, path = table_of(recording), tmp_path / "run.parquet"
     hole = np.where(np.arange(len(recording.t)) == 1801, np.nan, 0.0)
     write_columns(table | {"tau_elbow_joint": table["tau_elbow_joint"] + hole}, path)
-    layout, table = lay_out(path, robot.joints)
+    layout, table = lay_out(path, model.joints)
     short = replace(layout, notes=())
     monkeypatch.setattr(survey, "WINDOW", 100)
     window = (2.0, None)
-    log = survey_log(short, table, robot, SignalSettings(cutoff=None), window, length=LENGTH)
+    log = survey_log(short, table, model, SignalSettings(cutoff=None), window, length=LENGTH)
     pieces = pieces_of(log)
     pieces[-2]()
     with pytest.raises(DataError, match=r"tau_elbow_joint is NaN at row 1801 \(t = ") as found:
@@ -192,10 +186,10 @@ def test_a_hole_in_the_last_piece_is_named_by_its_row_in_the_file(
     assert found.value.code == "not_finite"
 
 
-def test_pieces_travel_as_they_are(robot, recording, tmp_path):
+def test_pieces_travel_as_they_are(model, recording, tmp_path):
     path = tmp_path / "run.parquet"
     write_log(recording, path)
-    pieces = pieces_of(long_log(robot, path, SignalSettings()))
+    pieces = pieces_of(long_log(model, path, SignalSettings()))
     for piece, again in zip(pieces, pickle.loads(pickle.dumps(pieces)), strict=True):
         np.testing.assert_array_equal(again().factors.R, piece().factors.R)
     # the model and the mapping go along once
@@ -241,15 +235,15 @@ def test_the_pieces_of_a_log_have_the_bias_of_all_rests_of_its_windows(monkeypat
     np.testing.assert_array_equal(a[:, 3:], biased[:, 3:])
 
 
-def test_means_of_segments_of_a_static_robot_replace_filter_and_rate(robot, recording):
+def test_means_of_segments_of_a_static_robot_replace_filter_and_rate(model, recording):
     signals = SignalSettings(
         cutoff=6.0, rate=50.0, velocity="measured", acceleration="measured", max_gap=0.1
     )
-    held = hold_log(replace(robot, dynamics="static"), recording, signals)
+    held = hold_log(replace(model, dynamics="static"), recording, signals)
     assert held.signals == replace(
         signals, cutoff=None, rate=None, velocity="differentiated", acceleration="differentiated"
     )
-    assert hold_log(robot, recording, signals).signals.rate == 50.0
+    assert hold_log(model, recording, signals).signals.rate == 50.0
 
 
 def test_other_drive_terms_keep_the_rows_and_torques_without_contact_forces(rng):

@@ -62,11 +62,6 @@ def groups_of(model, logs, standard, sigma=1.0, unit=None):
     return runs_of(model, own.mapping, standard, sums, units)
 
 
-@pytest.fixture(scope="module")
-def model():
-    return arm()
-
-
 def scaled(log, joint, factor):
     tau = log.tau.copy()
     tau[:, joint] *= factor

@@ -14,6 +14,7 @@ from helpers.robots import motion
 from scipy.spatial.transform import Rotation
 
 import robotid
+from robotid.base.exceptions import DataError
 from robotid.cli import main
 from robotid.data.log import Trajectory
 from robotid.dynamics.friction_projection import drive_moments, project_friction
@@ -302,20 +303,24 @@ def test_drives_correlate_as_the_fit_by_its_share_of_the_next_error(folder):
 def test_drives_of_commands_have_no_sample_below_zero(tmp_path):
     robot = plant("planar", np.random.default_rng(0))
     size = len(robot.model.standard_parameters())
-    names = [*robot.model.layout.names, *(n for n in robot.truth if n.endswith((".kd", ".delay")))]
+    names = [
+        *robot.model.layout.names,
+        *(n for n in robot.truth if n.endswith((".kp", ".kd", ".delay"))),
+    ]
     free = {n: x for n, x in robot.truth.items() if n.endswith((".kd", ".delay", ".viscous"))}
     root = np.diag([2.0 * free.get(name, 0.0) for name in names])  # twice their size
     covariance = {"names": names, "root": [row[: k + 1] for k, row in enumerate(root.tolist())]}
-    every, values = sample(
-        load_result(written_result(robot, tmp_path / "r", covariance=covariance)),
-        COUNT, np.random.default_rng(0),
-    )  # fmt: skip
+    result = load_result(written_result(robot, tmp_path / "r", covariance=covariance))
+    every, values = sample(result, COUNT, np.random.default_rng(0))
     assert every == names
     assert len(names) > size
     for name in free:
         drawn = values[:, every.index(name)]
         assert drawn.min() >= 0.0
         assert np.std(drawn) > 0.5 * free[name]
+    next(e for e in result.content["drive_parameters"] if e["name"].endswith(".kp"))["value"] = 0.0
+    with pytest.raises(DataError, match=r"result.json: no samples .*: kp or limit is 0"):
+        sample(result, COUNT, np.random.default_rng(0))
 
 
 def test_a_gain_that_varies_between_logs_has_no_range_below_zero(tmp_path):
