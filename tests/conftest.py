@@ -151,11 +151,9 @@ def browser():
 
 @pytest.fixture(scope="session")
 def identified(ur5, tmp_path_factory):
-    """A UR5 identified from files of synthetic logs; no two of its figures are alike.
-
-    Two logs were fitted, one was kept apart and has a gap; noise differs from joint to joint, and
-    is so large that prior and data, and WLS and the estimate, say different things.
-    """
+    """A UR5 identified from files of synthetic logs; no two of its figures are alike."""
+    # Two logs were fitted, one was kept apart and has a gap; noise differs from joint to joint, and
+    # is so large that prior and data, and WLS and the estimate, say different things.
     folder, rng = tmp_path_factory.mktemp("identified"), np.random.default_rng(7)
     noise = np.array([4.0, 8.0, 6.0, 1.6, 1.0, 0.6])  # [N m]
     logs = {}

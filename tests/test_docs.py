@@ -147,10 +147,8 @@ def test_the_page_on_simulation_says_what_the_settings_say_and_runs(tmp_path, mo
 
 @pytest.fixture
 def follow(tmp_path, monkeypatch, capsys):
-    """Do what a page says, block by block, as a user in an empty folder; return what it printed.
-
-    Trajectories are designed with a brief search, so figures may differ from those of the page.
-    """
+    """Do what a page says, block by block, as a user in an empty folder; return what it printed."""
+    # Trajectories are designed with a brief search, so figures may differ from those of the page.
     monkeypatch.chdir(tmp_path)
     leave_out_meshes(monkeypatch)
     paths = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}

@@ -88,10 +88,8 @@ def children(pid):
 
 
 def cut_off(job, out, number, workers, ended=None):
-    """Start the command line, send it a signal once three pieces are finished; code and stderr.
-
-    The processes that it had started are added to ``ended``.
-    """
+    """Start the command line, send it a signal once three pieces are finished; code and stderr."""
+    # The processes that it had started are added to ``ended``.
     mark = out.with_name("three pieces are finished")
     command = [sys.executable, HELD, mark, "3", "identify", job, "--out", out, "--workers", workers]
     run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)

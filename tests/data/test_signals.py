@@ -333,10 +333,8 @@ SPEEDS = np.array([[1.0, 0.0], [0.0, 1.0], [0.5, -1.0]])  # two joints, and a dr
 
 
 def recording(rng, *, jitter=0.2, gaps=(), start=0.0, samples=5000, pause=0.0):
-    """Return a noisy log of two joints, with gaps of half a second behind some rows.
-
-    Every two seconds the joints rest for a while.
-    """
+    """Return a noisy log of two joints, with gaps of half a second behind some rows."""
+    # Every two seconds the joints rest for a while.
     step = np.full(samples - 1, 1 / RATE) * (1 + jitter * rng.uniform(-1, 1, samples - 1))
     step[list(gaps)] = 0.5
     t = start + np.concatenate([[0.0], np.cumsum(step)])

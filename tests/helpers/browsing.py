@@ -65,10 +65,8 @@ def launch() -> Iterator[Any]:
 def visit(
     browser: Any, target: str | Path, *, size: tuple[int, int] = (1280, 800), **options: Any
 ) -> Iterator[Visit]:
-    """Open a file or an address in a window [px]; options are those of Playwright's new_context.
-
-    A page that is lost while it loads, as on a busy machine, is opened once more.
-    """
+    """Open a file or an address in a window [px]; options are those of Playwright's new_context."""
+    # A page that is lost while it loads, as on a busy machine, is opened once more.
     from playwright.sync_api import Error
 
     address = Path(target).resolve().as_uri() if isinstance(target, Path) else target

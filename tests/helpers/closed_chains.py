@@ -80,10 +80,8 @@ class Oracle:
         return [data.contact_force.linear for data in self.of_loops]
 
     def simulate(self, q, command, duration, step=5e-4):
-        """Return t, q, v and tau of a motion, integrated by Runge and Kutta's method.
-
-        It starts at rest at q, where the loops close; command(t, q, v) are torques at the joints.
-        """
+        """Return t, q, v and tau of a motion, integrated by Runge and Kutta's method."""
+        # It starts at rest at q, where the loops close; command(t, q, v) are torques at the joints.
         n, x, rows = len(q), np.append(q, np.zeros(len(q))), []
 
         def rate(t, x):

@@ -55,10 +55,9 @@ def _moments(model, pi):
 
 
 def written_result(plant, folder, *, position=None, limits=None, **changes):
-    """Write the result of a plant whose drives were found exactly; return its folder.
-
-    Position: by joint, as of ``by_position``; limits: of effort; changes: other keys of the result.
-    """
+    """Write the result of a plant whose drives were found exactly; return its folder."""
+    # Position: by joint, as of ``by_position``; limits: of effort; changes: other keys of the
+    # result.
     position = position or {}
     model = plant.model.with_terms({joint: terms for joint, (terms, _) in position.items()})
     values = dict(zip(model.layout.names, model.standard_parameters(), strict=True))

@@ -42,11 +42,9 @@ def driven(model, own, values):
 def driven_log(
     model, pi, seed, *, duration=30.0, rate=60.0, noise=0.01, reach=1.0, speed=1.0, still=()
 ):
-    """Return a log of inverse dynamics, of what drives remember, too.
-
-    The model's reference are its parameters pi. Noise is the share of each torque's typical size;
-    reach and speed are factors of a random motion; ``still`` numbers joints that stand.
-    """
+    """Return a log of inverse dynamics, of what drives remember, too."""
+    # The model's reference are its parameters pi. Noise is the share of each torque's typical size;
+    # reach and speed are factors of a random motion; ``still`` numbers joints that stand.
     rng = np.random.default_rng(seed)
     motion = _Scaled(random_fourier(model, rng, period=duration / 3), reach, speed, still)
     sensors = Sensors(acceleration=True, noise=Noise(tau=noise))

@@ -137,11 +137,9 @@ def record(
     path, hoist, seed, *, seconds, rate, start=0.0, noise=1.0, scale=None, velocity=False,
     speed=1.0, kind="tau", cut=(),
 ):  # fmt: skip
-    """Write a log as CSV, and return (t, q, v, a, tau without noise).
-
-    Noise and speed are factors; scale has factors of columns by their first letters, as
-    {"time": 1e3}; kind is the first letters of torques; cut, the first and last row that are lost.
-    """
+    """Write a log as CSV, and return (t, q, v, a, tau without noise)."""
+    # Noise and speed are factors; scale has factors of columns by their first letters, as {"time":
+    # 1e3}; kind is the first letters of torques; cut, the first and last row that are lost.
     t = np.arange(round(seconds * rate)) / rate
     q, v, a = motion(hoist.joints, seed, t, speed)
     exact = hoist.torque(q, v, a)
@@ -245,10 +243,8 @@ class Loop:
 
 
 def _rubbed(admittance, free, most):
-    """Return the speeds that friction, of impulses up to some size, leaves of free ones.
-
-    What would turn a joint round stops it; through the mass matrix it acts on other joints, too.
-    """
+    """Return the speeds that friction, of impulses up to some size, leaves of free ones."""
+    # What would turn a joint round stops it; through the mass matrix it acts on other joints, too.
     # of a few numbers: NumPy takes ten times as long as Python
     A, v, most, impulse = admittance.tolist(), free.tolist(), most.tolist(), [0.0] * len(free)
     joints = range(len(v))
@@ -265,10 +261,9 @@ def _rubbed(admittance, free, most):
 
 
 def follow(hoist, loop, wanted, *, step=5e-4):
-    """Return positions, velocities and torques of a robot that follows commands, shape (N, n).
-
-    Commands are wanted at each step, (N, n); of drives armature, viscous, coulomb and offset count.
-    """
+    """Return positions, velocities and torques of a robot that follows commands, shape (N, n)."""
+    # Commands are wanted at each step, (N, n); of drives armature, viscous, coulomb and offset
+    # count.
     model = hoist.model()
     data = model.createData()
     own_drives = [hoist.drives[j] for j in hoist.joints]

@@ -30,12 +30,10 @@ def solo_on_points():
 def spec_of(
     model, feet, *, step, armature=0.0, damping=0.0, friction=0.8, ground=0.02, springs=(), imu=None
 ):  # fmt: skip
-    """Return a MuJoCo model of a robot whose base floats, with small spheres as feet on a plane.
-
-    Feet are links that touch the ground, or the points of each that do, (k, 3) [m]; ground its time
-    constant [s]; springs stiffness and damping by passive joint; imu its placement in the base.
-    Loops of the robot are ``connect`` constraints.
-    """
+    """Return a MuJoCo model of a robot whose base floats, with small spheres as feet on a plane."""
+    # Feet are links that touch the ground, or the points of each that do, (k, 3) [m]; ground its
+    # time constant [s]; springs stiffness and damping by passive joint; imu its placement in the
+    # base. Loops of the robot are ``connect`` constraints.
     pin_model, names = model.pin_model, list(model.pin_model.names)
     spec, bodies = mujoco.MjSpec(), {}
     for i in range(1, pin_model.njoints):
@@ -136,14 +134,13 @@ def followed(
     torque=0.02, bits=18, armature=0.0, damping=0.0, height=None, force=False, ground=0.02,
     gantry=None, springs=(), friction=0.8, imu=None,
 ):  # fmt: skip
-    """Return the log of a robot on the ground whose joints follow a motion.
-
-    The motion gives positions [rad] and torques [N m] from the time, from -1 s on; posture is that
-    at -1 s, (n,) or (7 + n,) with the pose of the base, whose height [m] can be given. Torque is
-    the noise of the logged torques, bits those of the encoders; force tells whether forces of the
-    feet are logged in the world's axes. A gantry holds the base: its wrench at the origin from the
-    time, the pose (7,) and the speeds (6,) is logged, as are filtered values of an imu.
-    """
+    """Return the log of a robot on the ground whose joints follow a motion."""
+    # The motion gives positions [rad] and torques [N m] from the time, from -1 s on; posture is
+    # that at -1 s, (n,) or (7 + n,) with the pose of the base, whose height [m] can be given.
+    # Torque is the noise of the logged torques, bits those of the encoders; force tells whether
+    # forces of the feet are logged in the world's axes. A gantry holds the base: its wrench at the
+    # origin from the time, the pose (7,) and the speeds (6,) is logged, as are filtered values of
+    # an imu.
     mj = spec_of(
         model, feet, step=step, armature=armature, damping=damping, ground=ground, springs=springs,
         friction=friction, imu=imu,
@@ -245,11 +242,9 @@ def _logged(model, feet, mj, qpos, rows, rng, torque, bits, force):
 
 
 def with_other_bodies(model, rng, size=0.08):
-    """Return a robot whose bodies differ from those of a URDF, physically consistent.
-
-    Masses differ by up to 25 %. Each body is stretched and sheared, and its mass displaced, by a
-    share of the distance of its centre of mass plus its radius of gyration.
-    """
+    """Return a robot whose bodies differ from those of a URDF, physically consistent."""
+    # Masses differ by up to 25 %. Each body is stretched and sheared, and its mass displaced, by a
+    # share of the distance of its centre of mass plus its radius of gyration.
     pi = model.standard_parameters()[: model.layout.n_inertial]
     bodies = []
     for J in pseudo_inertia(pi):

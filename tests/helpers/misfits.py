@@ -75,12 +75,10 @@ def log_with(
     model, seed, effect=None, joint=1, *, duration=30.0, rate=100.0, noise=0.02, memory=0,
     coupling=None, part=0, size=1.0,
 ):  # fmt: skip
-    """Return a log of a robot like the model whose drives are viscous and Coulomb, but for one.
-
-    The seed makes the robot, with ``part`` also motion and noise; noise is the share of each
-    torque's typical size, memory its correlation time [samples]; coupling has ratios of a drive
-    that turns with several joints.
-    """
+    """Return a log of a robot like the model whose drives are viscous and Coulomb, but for one."""
+    # The seed makes the robot, with ``part`` also motion and noise; noise is the share of each
+    # torque's typical size, memory its correlation time [samples]; coupling has ratios of a drive
+    # that turns with several joints.
     rng = np.random.default_rng([seed, part])
     truth = model if coupling is None else model.from_urdf(
         model.tree.path, joints=model.joints, couplings=[Coupling("motor", coupling)]

@@ -97,11 +97,9 @@ def recorded(
     plant, rng, *, duration=10.0, rate=500.0, noise=1e-4, torque=None, speed=None, highest=4.0,
     step=_STEP,
 ):  # fmt: skip
-    """Return the log of a multi-sine that a plant was commanded to follow, and its truth.
-
-    Noise, torque and speed are standard deviations of what is logged; None: it is not. Each row has
-    a command that is held until the next; forces are half a step early.
-    """
+    """Return the log of a multi-sine that a plant was commanded to follow, and its truth."""
+    # Noise, torque and speed are standard deviations of what is logged; None: it is not. Each row
+    # has a command that is held until the next; forces are half a step early.
     t = np.arange(round(duration * rate)) / rate
     q_ref = multisine(t, plant.middle, plant.reach, rng, highest=highest)
     q, force, v = rolled_out(loaded(plant, rate, step), q_ref, rate)
@@ -125,12 +123,10 @@ def multisine(t, middle, reach, rng, lowest=0.1, highest=4.0):
 
 
 def loaded(plant, rate, step=_STEP, *, as_exported=False):
-    """Return MuJoCo's model of a plant, without shapes, its time step a part of the period.
-
-    An implicit step brakes by the speed at its end, half a step early, as if the rotor were heavier
-    by step / 2 (kd + viscous): the plant's is lighter by that, unless it is to be as exported. Its
-    roll-outs are then those of the smallest steps to 0.02 mrad.
-    """
+    """Return MuJoCo's model of a plant, without shapes, its time step a part of the period."""
+    # An implicit step brakes by the speed at its end, half a step early, as if the rotor were
+    # heavier by step / 2 (kd + viscous): the plant's is lighter by that, unless it is to be as
+    # exported. Its roll-outs are then those of the smallest steps to 0.02 mrad.
     pi = plant.parameters
     if plant.bodies is not None:
         pi[: plant.model.layout.n_inertial] = plant.bodies
@@ -154,11 +150,10 @@ def loaded(plant, rate, step=_STEP, *, as_exported=False):
 
 
 def held(plant, q_ref, rate, clock, settles=_SETTLES):
-    """Return positions under a controller that holds its torque between ticks, shape (N, n).
-
-    Motors, without delay, get what it makes of MuJoCo's own position and speed; Runge-Kutta's steps
-    between. Commands (N, n) come at a rate, ticks at that of a clock [Hz], the first together.
-    """
+    """Return positions under a controller that holds its torque between ticks, shape (N, n)."""
+    # Motors, without delay, get what it makes of MuJoCo's own position and speed; Runge-Kutta's
+    # steps between. Commands (N, n) come at a rate, ticks at that of a clock [Hz], the first
+    # together.
     robot = loaded(plant, rate, as_exported=True)
     robot.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
     robot.actuator_gainprm[:, 0], robot.actuator_biasprm[:, :3] = 1.0, 0.0
@@ -176,10 +171,9 @@ def held(plant, q_ref, rate, clock, settles=_SETTLES):
 
 
 def rolled_out(robot, q_ref, rate, settles=_SETTLES):
-    """Return positions, forces and speeds of MuJoCo's robot, (N, n), at times of held commands.
-
-    Its actuators are in the order of the commands, the first of which is held until it settles [s].
-    """
+    """Return positions, forces and speeds of MuJoCo's robot, (N, n), at times of held commands."""
+    # Its actuators are in the order of the commands, the first of which is held until it settles
+    # [s].
     held = round(1.0 / rate / robot.opt.timestep)
     at = robot.jnt_qposadr[robot.actuator_trnid[:, 0]]
     data = mujoco.MjData(robot)
@@ -205,11 +199,9 @@ def rolled_out(robot, q_ref, rate, settles=_SETTLES):
 def torque_log(
     plant, rng, *, duration, rate=250.0, fine=16000.0, noise=0.0, torque=0.0, relative=0.0
 ):
-    """Return the log of a plant's positions and of the torques that move it, without commands.
-
-    The loop runs so much faster (fine) than the log is written (rate) that its torque is smooth
-    between rows. Noise of encoders, of torques, and of torques relative to their typical size.
-    """
+    """Return the log of a plant's positions and of the torques that move it, without commands."""
+    # The loop runs so much faster (fine) than the log is written (rate) that its torque is smooth
+    # between rows. Noise of encoders, of torques, and of torques relative to their typical size.
     t = np.arange(round(duration * fine)) / fine
     q_ref = multisine(t, plant.middle, plant.reach, rng)
     robot = loaded(plant, fine, 1.0 / fine)

@@ -25,11 +25,9 @@ STEP = 1e-3  # [s]
 
 
 def record(commands, servos, *, rate=200.0, duration=20.0, seed=0, couple=None, hold=1):
-    """Return the log of servos that are told commands(t), shape (N, n).
-
-    The force of Coulomb friction is implicit, so joints stick; couple(t, q) shifts what encoders
-    see, as a base that moves; a command is updated every so many rows.
-    """
+    """Return the log of servos that are told commands(t), shape (N, n)."""
+    # The force of Coulomb friction is implicit, so joints stick; couple(t, q) shifts what encoders
+    # see, as a base that moves; a command is updated every so many rows.
     rng = np.random.default_rng(seed)
     t = np.arange(round(duration / STEP)) * STEP
     told = hold / rate * np.floor(t / (hold / rate) + 1e-9)

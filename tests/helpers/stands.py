@@ -54,10 +54,8 @@ class FloatingMotion:
 
 
 def recorded(model, pi, motion, rng, *, rate, duration, acceleration=True, noise=0.01):
-    """Return the log of a robot that follows a motion by the smallest forces of the ground.
-
-    Rate [Hz], duration [s], noise of the torques [N m]; accelerations are logged or not.
-    """
+    """Return the log of a robot that follows a motion by the smallest forces of the ground."""
+    # Rate [Hz], duration [s], noise of the torques [N m]; accelerations are logged or not.
     t, robot = np.arange(round(duration * rate) + 1) / rate, model.with_reference(pi)
     (q, v, a), flags = motion.evaluate(t), motion.touching(t)
     still, segment = np.zeros_like(v), np.zeros(len(t), dtype=int)
@@ -81,11 +79,9 @@ def recorded(model, pi, motion, rng, *, rate, duration, acceleration=True, noise
 
 
 def stand(model, middle, height, rng, *, parts=4, length=3.0, rate=100.0, size=1.0):
-    """Return a motion whose base sways; a leg is in the air in each part but the first.
-
-    Joints of the model are in order of its contacts, as many at each leg; it stands in the middle
-    posture. Size is a factor on the motion of the base: 1 is a few centimetres.
-    """
+    """Return a motion whose base sways; a leg is in the air in each part but the first."""
+    # Joints of the model are in order of its contacts, as many at each leg; it stands in the middle
+    # posture. Size is a factor on the motion of the base: 1 is a few centimetres.
     t = np.arange(round(parts * length * rate) + 1) / rate
     part = np.minimum((t / length).astype(int), parts - 1)
     s = t / length - part

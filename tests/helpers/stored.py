@@ -55,10 +55,8 @@ class Runs:
         self.documents = {}
 
     def run(self, name, line, code=0):
-        """Run what follows ``robotid``, @ being the folder; keep and return what it prints.
-
-        The exit code is ``code``; if that is None, it is kept, too.
-        """
+        """Run what follows ``robotid``, @ being the folder; keep and return what it prints."""
+        # The exit code is ``code``; if that is None, it is kept, too.
         words = line.replace("@", f"{self.folder}/").split()
         out, err = io.StringIO(), io.StringIO()
         surroundings = {"COLUMNS": "100", "NO_COLOR": "1"}
@@ -289,10 +287,8 @@ def told_columns(packed):
 
 
 def differences(stored, found, at="", *, times=1.0, room=0.0):
-    """Yield where two values differ, and how.
-
-    Typical tolerances are allowed ``times``, and a difference of ``room`` whatever the size.
-    """
+    """Yield where two values differ, and how."""
+    # Typical tolerances are allowed ``times``, and a difference of ``room`` whatever the size.
     if isinstance(stored, dict) and isinstance(found, dict):
         beside = room or times * _spread(stored)
         for key in sorted(stored.keys() | found.keys()):

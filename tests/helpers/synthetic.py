@@ -34,10 +34,8 @@ def truth(model, seed=0):
 
 
 def payload_log(model, rng, *, mass=2.0, at=10.0, duration=15.0, rate=200.0, noise=0.02):
-    """Return the log of a robot that picks up a load while it moves, without velocities.
-
-    The load, a ball of 5 cm, hangs 10 cm behind the last joint; noise: share of each torque.
-    """
+    """Return the log of a robot that picks up a load while it moves, without velocities."""
+    # The load, a ball of 5 cm, hangs 10 cm behind the last joint; noise: share of each torque.
     ball = 0.4 * mass * 0.05**2
     load = Payload(
         model.layout.bodies[-1], mass, com=(0.0, 0.0, 0.1), start=at,

@@ -207,6 +207,10 @@ FAULTS = {
     "scale of a position": (
         lambda log: replace(log, q=log.q * [*[1] * 5, 1.3, *[1] * 6]), {"angle_scale": "FR_calf"}
     ),
+    "gain of the knees": (
+        lambda log: replace(log, tau=log.tau * ([1, 1, 1.3] * 4)),
+        {"current_for_torque": "FL_calf FR_calf RL_calf RR_calf"},
+    ),
 }  # fmt: skip
 
 

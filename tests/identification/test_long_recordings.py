@@ -46,12 +46,10 @@ def without_doctor(monkeypatch):
 
 
 def assert_same(one, other, first, second):
-    """Check a job in pieces, the second, beside that in memory.
-
-    Standard errors are the scatter of segments, which pieces cut elsewhere. One that depends on f
-    degrees of freedom is itself known to 1 / sqrt(2 f): so far, with the f of both, may their
-    logarithms differ. Of 60 normal values one is beyond 4 standard deviations in one case of 260.
-    """
+    """Check a job in pieces, the second, beside that in memory."""
+    # Standard errors are the scatter of segments, which pieces cut elsewhere. One that depends on f
+    # degrees of freedom is itself known to 1 / sqrt(2 f): so far, with the f of both, may their
+    # logarithms differ. Of 60 normal values one is beyond 4 standard deviations in one case of 260.
     wls = one.wls.theta
     np.testing.assert_allclose(other.wls.theta, wls, rtol=0, atol=1e-9 * np.abs(wls).max())
     np.testing.assert_allclose(other.prior_std, one.prior_std, rtol=1e-9)

@@ -367,11 +367,13 @@ def _bunches(log: Log, step: Array) -> Iterator[Finding]:
     change = np.abs(np.diff(log.q[:, int(np.argmax(moved))]))  # of the joint that moves most
     if share < SHARE_OF_ROWS or change[is_bunched].mean() <= BETTER * change.mean():
         return
-    usual = float(np.median(step[~is_bunched]))
+    even = np.linspace(log.t[0], log.t[-1], len(log.t))
+    pause = step[:-1][is_bunched[1:] & ~is_bunched[:-1]].max(initial=0.0)
     yield finding(
         "bunched_stamps", log.name, rows=float(is_bunched.sum()), share=share, of=len(log.t),
-        longest=float(step.max()), within=DIFFERS * mean, mean=mean, usual=usual,
-        cure=abs(mean / usual - 1.0) < AGREES,
+        longest=float(step.max()), within=DIFFERS * mean, mean=mean,
+        severity="error" if share > BETTER else "warning",
+        cure=bool((np.abs(log.t - even) <= pause).all()),
     )  # fmt: skip
 
 
@@ -451,7 +453,7 @@ def _clipping(log: Log) -> Iterator[Finding]:
                 "constant_torque", log.name, joint, value=value, quoted=quoted(joint), **words
             )
             continue
-        band = (BEYOND_NOISE + 1) * noise[j] / np.sqrt(_AROUND)  # from 3 errors above to 1 below
+        band = (BEYOND_NOISE + 2) * noise[j] / np.sqrt(_AROUND)  # from 3 errors above to 2 below
         if not own[:, j].any():
             continue
         for sign in (1.0, -1.0):
@@ -461,10 +463,11 @@ def _clipping(log: Log) -> Iterator[Finding]:
             if at.sum() >= fewest > rows:
                 runs = [(i, k) for i, k in runs_of(depth <= 4 * band) if at[i:k].any()]
                 near = sum(int(own[i:k, j].sum()) for i, k in runs)
-                along = np.sum(sign * travel[:, j] > least[:, 0])
-                is_flat = MOST * near < at.sum() < MOST * along  # else a maximum, or friction
+                along = sign * travel[:, j] > least[:, 0]
+                is_friction = np.sum(at & along) >= MOST * np.sum(along)
+                is_flat = MOST * near < at.sum() and not is_friction  # else a maximum
                 is_largest = np.ptp(smooth[:, j]) <= 2 * np.max(sign * smooth[:, j]) + 4 * band
-                if is_flat and is_largest and 4 * band < np.median(depth):
+                if is_flat and is_largest and 4 * band < BETTER * np.max(depth):
                     limit = float(np.median(x[at]))
                     rows = np.sum((np.abs(x - limit) <= BEYOND_NOISE * noise[j]) & moving)
             if rows >= fewest and not np.ptp(x) < units.COARSE * units.quantum(x):

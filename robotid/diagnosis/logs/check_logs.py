@@ -92,7 +92,10 @@ def _examine_log(model: RobotModel, log: Log, signals: SignalSettings) -> _Exami
     findings = [finding("log_note", name, text=note) for note in log.notes]
     findings += [finding("log_assumption", name, text=text) for text in log.assumed]
     if not model.is_static:  # rows of static poses may have gaps between them
-        findings += [*channels.check_clock(log), *channels.check_channels(log, signals)]
+        clock = list(channels.check_clock(log))
+        if without := [x for x in clock if (x.code, x.severity) == ("bunched_stamps", "error")]:
+            return _Examined(log, without)  # no times of rows: nothing else can be said
+        findings += [*clock, *channels.check_channels(log, signals)]
     findings += channels.check_limits(log, model.limits)
     prismatic = [limit.name for limit in model.limits if limit.type == "prismatic"]
     findings += check_commands(log, prismatic)

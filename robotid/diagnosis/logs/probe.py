@@ -10,7 +10,7 @@ from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process, resolve, unwrap
 from robotid.data.units import AT_REST
-from robotid.diagnosis.decisions import ZERO
+from robotid.diagnosis.decisions import AGREES, NOTHING, ZERO
 from robotid.dynamics.constraint_rows import touching
 from robotid.dynamics.rows import (
     InertialRows,
@@ -20,6 +20,7 @@ from robotid.dynamics.rows import (
     inertial_rows,
 )
 from robotid.robot.model import RobotModel
+from robotid.robot.prior import prior_spread
 
 _MARGIN = 0.15  # [s] rows closer to the end of a segment are not used: the filter has not settled
 
@@ -55,6 +56,15 @@ class Probe:
         """Torque of each link by the URDF, shape (N, n, bodies)."""
         pi = self.model.standard_parameters()[: self.model.layout.n_inertial]
         return self._torques(pi[:, None] * np.repeat(np.eye(len(pi) // 10), 10, axis=0))
+
+    @cached_property
+    def uncertain(self) -> Array:
+        """Share of each torque that errors of the URDF's centres of mass explain, shape (n,)."""
+        p = self.model.layout.n_inertial
+        spread = AGREES * prior_spread(self.model, np.ones((3, self.model.n_rows)), 1)[:p]
+        moments = np.diag(spread)[:, np.isin(np.arange(p) % 10, (1, 2, 3))]
+        squares = np.mean(np.sum(self._torques(moments) ** 2, axis=2), axis=0)
+        return np.asarray(squares / np.maximum(self.tau.var(axis=0), NOTHING))
 
     def _torques(self, stacked: Array) -> Array:
         """Return the torques of bodies, shape (N, n, k): stacked (p, k)."""

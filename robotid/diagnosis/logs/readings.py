@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.diagnosis.decisions import EXACT, TENFOLD, ZERO
+from robotid.diagnosis.decisions import BETTER, EXACT, TENFOLD, ZERO
 from robotid.diagnosis.logs.probe import Probe, drive_columns
 from robotid.dynamics.constraint_rows import constraint_jacobian, force_basis, without_forces
 from robotid.dynamics.rows import inertial_rows, joint_constants
@@ -163,12 +163,15 @@ class Samples:
         motion = replace(motion, size=moves * motion.variation)
         return cls(motion, np.arange(len(one)), one, one)
 
-    def few(self) -> "Samples":
+    def few(self, count: int = _FEW) -> "Samples":
         """Return some of the instants, in one segment, with bodies nearer the URDF's."""
-        step = max(1, len(self.motion.q) // _FEW)
+        step = max(1, len(self.motion.q) // count)
         some = {x: getattr(self.motion, x)[::step] for x in ("q", "v", "a", "tau", "contacts")}
         few = self.changed(segments=1, spread=self.motion.spread / _LOOSE, **some)
-        return few.changed(size=(self.motion.size > 0.0) * few.motion.variation)
+        few = few.changed(size=(self.motion.size > 0.0) * few.motion.variation)
+        # so few that bodies explain a torque that they do not explain in all instants
+        is_explained = (self.share > _GROSS) & (few.share < BETTER * self.share)
+        return self.few(2 * count) if is_explained.any() and step > 1 else few
 
     def changed(self, **values: Any) -> "Samples":  # noqa: ANN401
         """Return the samples with other values of the motion or of the robot."""
@@ -369,7 +372,8 @@ def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
     for group in (samples.unsigned, *zip(samples.unsigned, strict=True)):
         yield Reading("unsigned_torque", group, partial(_signed, joints=group))
     wrists = [tuple(rows[first:]) for first in range(1, len(rows) - 1)]
-    for group in [tuple(rows), *singles, *(legs or wrists)]:
+    alike = zip(*legs, strict=True) if len({len(x) for x in legs}) == 1 else ()  # as all knees
+    for group in [tuple(rows), *alike, *singles, *(legs or wrists)]:
         named, on = group if len(group) < len(rows) else every, one[list(group)].sum(axis=0)
         scaled = Reading("current_for_torque", named, partial(_scaled, on=on), (), 0.3)
         yield from scaled.started(samples)

@@ -86,6 +86,8 @@ def _findings(samples: Samples, found: Sequence[Best], log: str) -> Iterator[Fin
     """Yield the findings of readings that explain the torques together."""
     rows, joints = samples.motion.rows.tolist(), samples.motion.model.row_names
     final = found[-1].after if found else np.zeros(len(rows))
+    if found and (final > decisions.BETTER**2 * found[0].before).all():
+        return  # together they explain no torque
     exchanged: dict[str, list[Best]] = {}
     for one in found:
         reading, named = one.reading, one.reading.joints or rows
@@ -133,25 +135,21 @@ def _finding(samples: Samples, one: Best, log: str) -> Finding:
         ),
     }  # fmt: skip
     if reading.code == "gravity":
-        best, stated = (
-            np.array(x.motion.model.pin_model.gravity.linear)
-            for x in (reading.of(samples), samples)
-        )
+        robots = (x.motion.model.pin_model for x in (reading.of(samples), samples))
+        best, stated = (np.array(x.gravity.linear) for x in robots)
         lengths = np.linalg.norm(best) * np.linalg.norm(stated)
         angle = float(np.degrees(np.arccos(np.clip(best @ stated / max(lengths, TINY), -1.0, 1.0))))
         shown = (", ".join(f"{x:.2f}" for x in vector) for vector in (best, stated))
         values |= dict(zip(("best", "stated"), shown, strict=True)) | {"angle_deg": angle}
         values |= dict(zip("xyz", best.tolist(), strict=True))
         values["severity"] = "error" if angle > _WRONG_TILT else "warning"
-    elif reading.code == "position_offset":
-        values["offset"] = reading.values[0]
-    elif reading.code == "angle_scale":
-        values["factor"] = 1.0 + reading.values[0]
-    elif reading.code in ("time_scale", "current_for_torque"):
-        key = "speed" if reading.code == "time_scale" else "factor"
-        values[key] = float(np.exp(-reading.values[0]))
     elif reading.code == "gravity_compensated":
         values["what"] = "joint" if names else "robot"
+    elif reading.values:
+        key = {"position_offset": "offset", "time_scale": "speed"}.get(reading.code, "factor")
+        x = reading.values[0]
+        sizes = {"position_offset": x, "angle_scale": 1.0 + x}
+        values[key] = sizes.get(reading.code, float(np.exp(-x)))
     return finding(reading.code, log, names, **values)
 
 
@@ -231,7 +229,9 @@ def _check_loads(probe: Probe, share: Array, name: str, is_explained: bool) -> I
     if not is_this_robot and (what := _subtracted(probe, model)):
         yield finding("gravity_compensated", name, what=what)
     elif is_explained:
-        scale, is_better = (1.0, False) if is_this_robot else _torque_scale(model)
+        # errors of the URDF's centres of mass are no other robot
+        is_other = not load_model(probe, share + probe.uncertain).is_this_robot()
+        scale = 1.0 if is_this_robot else _torque_scale(model)
         if scale != 1.0 and model.is_this_robot(scale):
             used = np.array(probe.model.joints)[model.R.any(axis=(1, 2))].tolist()
             is_unit = len(used) == len(share) and abs(np.log(scale)) > np.log(_OTHER_UNIT)
@@ -240,11 +240,11 @@ def _check_loads(probe: Probe, share: Array, name: str, is_explained: bool) -> I
                 joints=len(used), severity="error" if is_unit else "warning", factor=scale,
                 joint=listed(used),
             )  # fmt: skip
-        elif is_better or _error_of_links(theta) > _MISMATCH:
+        elif is_other or _error_of_links(theta) > _MISMATCH:
             factors = dict(zip(probe.model.layout.bodies, theta[:-4].tolist(), strict=True))
             words = ", ".join(f"{link} {factor:.2g}" for link, factor in factors.items())
             mismatch = finding("urdf_mismatch", name, factors=words, **factors)
-            yield from _reread(probe, share, name) or [mismatch]
+            yield from _reread(probe, share, name) or [mismatch] * is_other
         else:
             yield from _payload(probe, theta[-4:], float(error[-4]), name)
 
@@ -264,7 +264,7 @@ def _subtracted(probe: Probe, model: LoadModel) -> str:
     added = replace(model, R=R)
     # a small torque fits in another scale, too: of bodies beside which friction is not most of it
     bare = Samples.of(probe, rows, rows >= 0).changed(gravity=0.0 * rows, inertia=0.0 * rows)
-    is_clear = model.misfit(_torque_scale(model)[0]) - added.misfit(1.0) > SIGNIFICANT**2
+    is_clear = model.misfit(_torque_scale(model)) - added.misfit(1.0) > SIGNIFICANT**2
     is_clear |= bool((bare.share < 1.0 - decisions.MOST).all())
     return "model" if is_clear and added.is_this_robot() else ""
 
@@ -307,13 +307,10 @@ def _error_of_links(theta: Array) -> float:
     return float(np.sum(((theta[:-4] - 1.0) / _SPREAD) ** 2))
 
 
-def _torque_scale(model: LoadModel) -> tuple[float, bool]:
-    """Return the best common factor beyond errors of masses, and whether it or one is better."""
+def _torque_scale(model: LoadModel) -> float:
+    """Return the best common factor beyond errors of masses."""
     far = _SCALES[np.abs(np.log(_SCALES)) > np.log(NO_ERROR_OF_MASSES)]
-    common = float(min(far, key=model.misfit))
-    each = np.where(np.eye(len(model.R), dtype=bool)[:, None], _SCALES[:, None], 1.0)
-    least = min(map(model.misfit, (common, *each.reshape(-1, len(model.R)))))
-    return common, model.misfit(1.0) - least > SIGNIFICANT**2
+    return float(min(far, key=model.misfit))
 
 
 def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Finding]:

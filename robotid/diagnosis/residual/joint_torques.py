@@ -271,11 +271,9 @@ def _broadband_shares(evaluations: Sequence[Evaluation]) -> list[float | None]:
 
 
 def _beyond_torque(evaluations: Sequence[Evaluation]) -> tuple[float, Array]:
-    """Return a frequency [Hz] above which a residual has clearly more power than its torque.
-
-    It is the highest one of all rows; with it the share of each row's squared residual from there
-    to the filter's cut-off, which is 0 if the torque is not that small. Of the longest segment.
-    """
+    """Return a frequency [Hz] above which a residual has clearly more power than its torque."""
+    # It is the highest one of all rows; with it the share of each row's squared residual from there
+    # to the filter's cut-off, which is 0 if the torque is not that small. Of the longest segment.
     _, e, k = max(
         ((np.ptp(motion.t[k]), e, k)
          for e in evaluations for motion in [e.recording.trajectory]

@@ -63,12 +63,8 @@ def fit_findings(
     if fit.outliers:
         yield _of_outliers(fit)
     yield from (misfit_finding(misfit, fit, on_misfit) for misfit in misfits)
-    yield from (
-        *_drive_findings(fit),
-        *correlated_findings(fit),
-        *discrepancies,
-        *encoder_noise(fit),
-    )
+    yield from (*_drive_findings(fit), *correlated_findings(fit))
+    yield from (*discrepancies, *encoder_noise(fit))
     for e in fit.refitted:
         yield finding("validation_was_fitted", subject=e.recording.log.path, name=e.recording.name)
     yield from _costs(fit)

@@ -166,10 +166,8 @@ def places_of(n: int, P: int, n_bristles: int, is_held: bool) -> tuple[Places, A
 
 @inner
 def _balance(work, at, robot, step, now):
-    """Write the residual G of a step's equation for the speeds u, and its derivative H.
-
-    Rows are divided by e = 1 + mu s(u) sign(tau) of gears with friction mu |tau|: H is symmetric.
-    """
+    """Write the residual G of a step's equation for the speeds u, and its derivative H."""
+    # Rows are divided by e = 1 + mu s(u) sign(tau) of gears with friction mu |tau|: H is symmetric.
     n, drives, terms = at.n, robot.drives, robot.terms
     codes, shapes, values, spans, _ = terms
     _presliding(work, at, terms, THETA * step)

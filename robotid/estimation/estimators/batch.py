@@ -121,11 +121,8 @@ class TLS(BatchEstimator):
         return replace(wls, theta=theta, sigma=sigma, message=message)
 
     def _split(self, R: Array, noise: Array, theta: Array) -> tuple[Array, float]:
-        """Return the parameters and the share of the residual due to the regressor's noise.
-
-        The residual of WLS, 1 in these units, is noise of the torque and of the regressor times
-        theta.
-        """
+        """Return the parameters and the share of the residual due to the regressor's noise."""
+        # The residual of WLS, 1 in these units, is noise of torque and regressor times theta.
         for _ in range(_MAX_ITERATIONS):
             share = float(((noise * theta) ** 2).sum())
             if self.regressor_noise is None and share > MOST_EXPLAINED:

@@ -589,12 +589,10 @@ def _search(
     score: Callable[[float], tuple[float, Array]], how: str, allowed: float,
     least: Array | None = None, usual: float = _SMALLEST,
 ) -> WeightChoice:  # fmt: skip
-    """Return the largest weight that ``_is_accepted`` in comparison with that of smallest score.
-
-    ``score`` returns the score and its parts by segment and joint, or none. Below the usual
-    smallest weight, others are tried while the largest ratio of a joint's error to that of least
-    squares (n,) is too large and decreases.
-    """
+    """Return the largest weight that ``_is_accepted`` in comparison with that of smallest score."""
+    # ``score`` returns the score and its parts by segment and joint, or none. Below the usual
+    # smallest weight, others are tried while the largest ratio of a joint's error to that of least
+    # squares (n,) is too large and decreases.
     tried: dict[float, float] = {}
     parts: dict[float, Array] = {}
     loss: dict[float, float] = {}
@@ -631,11 +629,9 @@ def _search(
 
 
 def _is_accepted(parts: Array, best: Array, allowed: float) -> bool:
-    """Return whether errors are about as small as the best ones, both of shape (segments, n).
-
-    The RMS error, its geometric mean over joints, is at most 2 % larger, and that of any joint 5 %.
-    The mean log ratio by segment is at most the allowed one, or two standard errors.
-    """
+    """Return whether errors are about as small as the best ones, both of shape (segments, n)."""
+    # The RMS error, its geometric mean over joints, is at most 2 % larger, and that of any joint
+    # 5 %. The mean log ratio by segment is at most the allowed one, or two standard errors.
     if not parts.size:
         return False
     ratio = np.sqrt(_by_joint(parts) / _by_joint(best))  # (n,)

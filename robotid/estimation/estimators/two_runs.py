@@ -106,10 +106,8 @@ class TwoRuns:
 
     @cached_property
     def _noise(self) -> Array:
-        """Noise level of each joint's signal from separate fits of the runs, shape (n,), above 0.
-
-        A joint that moves in a few rows only has its RMS signal, rows projected together one level.
-        """
+        """Noise level of each joint's signal, above 0, from separate fits of the runs, (n,)."""
+        # A joint that moves in few rows has its RMS signal, rows projected together one level.
         rows, separate = np.maximum(self._logged.rows, 1), [run.triangles for run in self._whole]
         squares: Array = np.sum([[R[-1, -1] ** 2 for R in run] for run in separate], axis=0)
         used = np.array([len(columns) for columns in self._logged.columns])
@@ -186,12 +184,10 @@ class TwoRuns:
     def _errors(
         self, gain: Array, at: Array | None, solution: Array, bread: Array
     ) -> tuple[Array, Array]:
-        """Return covariance and degrees of freedom, including the uncertainty of the prior.
-
-        The scatter between segments has errors that vary with time, that between the joints of each
-        run constant ones, as of a gain or of friction. The larger standard error is used, and at
-        least that of independent noise.
-        """
+        """Return covariance and degrees of freedom, including the uncertainty of the prior."""
+        # The scatter between segments has errors that vary with time, that between the joints of
+        # each run constant ones, as of a gain or of friction. The larger standard error is used,
+        # and at least that of independent noise.
         if len(self.reference) + len(self.loaded) < FEWEST_SEGMENTS:
             return bread, np.full(len(solution), np.inf)
         runs = list(enumerate((self.reference, self.loaded)))

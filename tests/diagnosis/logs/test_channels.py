@@ -299,6 +299,16 @@ def test_a_torque_that_is_clipped_under_noise_is_named_and_no_other(noise, least
     assert named >= least
 
 
+def test_a_torque_that_gravity_loads_in_one_direction_is_clipped_in_most_rows():
+    t, rng = np.arange(4000) / 200, np.random.default_rng(0)
+    q = 0.6 * np.sin(2 * t) + 0.3 * np.sin(3.3 * t)
+    tau = np.maximum(-60.0 * np.cos(q) - 4.0 * np.sign(np.cos(2 * t)), -48.0)
+    tau += 0.2 * rng.standard_normal(len(t))
+    log = Log(t, q[:, None], tau[:, None], ("lift",), path="run.csv")
+    (found,) = check_torque_channels(log)
+    assert (found.code, found.evidence["limit"]) == ("clipped", pytest.approx(-48.0, abs=0.1))
+
+
 # --- clock, rows and rests ------------------------------------------------------------------------
 START = 3.0  # [s]: no log starts at 0
 
@@ -381,7 +391,7 @@ def test_rows_that_are_stamped_on_arrival_are_named_with_their_remedy():
     assert Figures(found) == {
         "rows": late, "share": pytest.approx(late / 899), "longest": pytest.approx(0.0595)
     }  # fmt: skip
-    assert "the mean step is 10 ms, the typical one 10 ms, so no rows" in found.message
+    assert "no stamp is farther than a pause from equal steps of 10 ms, so no" in found.message
     assert 'so no rows are missing: set stamp = "even" in [log]' in found.message
     missing = said(check_clock(clocked_log(bunched(lost=90))))["bunched_stamps"]
     assert missing.message.endswith("are wrong; log the time of recording")

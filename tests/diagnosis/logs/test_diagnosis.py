@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.corruptions import CASES, NOISE, ROBOTS, clean_log, controlled_log, robot, table_of
+from helpers.legged import with_other_bodies
 from helpers.synthetic import exact_log, perfect, truth
 
 from robotid.base.findings import Finding, grouped
@@ -152,6 +153,17 @@ def recorded(model, change=lambda robot: None, gravity=1.0, inertia=1.0, gain=(1
     return Log(t=t, q=q, tau=np.asarray(gain) * tau, joints=model.joints, path="run.csv")
 
 
+def pulled(model, log):
+    """Return a log with a force beside the last link, constant in the world."""
+    engine, point, force = model.pin_model, np.array([-0.2, -0.1, -0.1]), [-13.0, -6.0, 2.0]
+    data, tau = engine.createData(), log.tau.copy()
+    for k, q in enumerate(log.q):
+        J = pin.computeJointJacobian(engine, data, q, 6)
+        pin.forwardKinematics(engine, data, q)
+        tau[k] -= (J[:3].T + np.cross(J[3:].T, point)) @ data.oMi[6].rotation.T @ force
+    return replace(log, tau=tau)
+
+
 def hung(robot):
     robot.gravity.linear = 9.81 * np.array([0.0, np.sin(0.35), -np.cos(0.35)])
 
@@ -160,6 +172,8 @@ SHIFT = np.pi / 2 * np.array([0.0, 1.0, 0.0, 0.0, 1.0, 0.0])
 QUARTER = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 READ = {
     "as it is": (lambda m: (m, recorded(m)), {}),
+    "other bodies": (lambda m: (m, recorded(with_other_bodies(m, np.random.default_rng(0)))), {}),
+    "pulled": (lambda m: (m, pulled(m, recorded(m))), {"unexplained_torque": ("wrist_3_joint",)}),
     "clock": (lambda m: (m, (x := recorded(m), replace(x, t=2 * x.t))[1]), {"time_scale": ()}),
     "slow": (lambda m: (m, (x := recorded(m), replace(x, t=1.25 * x.t))[1]), {"time_scale": ()}),
     "two zeros": (lambda m: (m, (x := recorded(m), replace(x, q=x.q + SHIFT))[1]), {
@@ -244,6 +258,15 @@ def test_a_recording_that_is_fitted_twice_is_named(ur5, short):
     (found,) = [f for f in findings if f.code == "repeated_log"]
     assert (found.where, found.severity) == ("again.csv", "warning")
     assert f"the same recording as {short.name}" in found.message
+
+
+def test_rows_that_are_stamped_on_arrival_have_no_other_fault(ur5, short):
+    k = np.arange(len(short.t))
+    t = short.t[np.minimum(k // 8 * 8 + 7, len(k) - 1)] + 1e-5 * (k % 8)
+    found = diagnose(ur5, [replace(short, t=t)], [], SIGNALS)
+    assert {f.code: f.severity for f in found if f.severity != "note"} == {
+        "bunched_stamps": "error"
+    }
 
 
 def test_an_origin_in_millimetres_is_the_only_cause(short, tmp_path):

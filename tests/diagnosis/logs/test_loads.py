@@ -92,6 +92,15 @@ def test_a_reading_starts_near_the_three_points_of_its_parabola():
     assert start.values == pytest.approx((-3.0,))
 
 
+def test_instants_are_added_until_they_show_what_is_not_explained(ur5, ur5_log):
+    probe = take_probe(ur5, smooth_motion(ur5, ur5_log, SIGNALS))
+    tau = probe.tau.copy()
+    tau[np.arange(len(tau)) % (len(tau) // 24) > 0, 2] *= -1.0  # not in the first 24
+    spoilt = TorqueCheck.of(replace(probe, tau=tau)).limbs[0][0]
+    assert spoilt.share[2] > 0.1
+    assert spoilt.few().share[2] > 0.5 * spoilt.share[2]
+
+
 def test_the_first_second_of_a_clean_log_has_no_scale(ur5):
     assert loads(ur5, clean_log(ur5, 10).window(end=1.495)) == []
 

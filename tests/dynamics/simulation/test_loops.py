@@ -80,10 +80,8 @@ def rolled(model, loops, log, step=2e-3):
 
 
 def integrated(model, loops, log, friction, share=0.0):
-    """Return positions by a stiff integration of Pinocchio's dynamics, command by command.
-
-    Gears lose a share of the torque that they pass on to the bodies.
-    """
+    """Return positions by a stiff integration of Pinocchio's dynamics, command by command."""
+    # Gears lose a share of the torque that they pass on to the bodies.
     engine, n = model.pin_model, len(model.joints)
     data, lower, diagonal = engine.createData(), np.tril_indices(n, -1), np.diag_indices(n)
 

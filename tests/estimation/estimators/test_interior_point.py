@@ -47,12 +47,10 @@ def random_fit(file, rng, **settings):
 
 
 def by_clarabel(fit, rows, weight, near, unit):
-    """Return y of the minimum pi = near + unit y, stated as a cone programme.
-
-    log det J is the largest sum t_i, t_i <= log Z_ii, of a lower triangle Z for which
-    [[J, Z], [Z^T, diag(Z_ii)]] is positive semidefinite. J is in units of that of near, and the
-    columns of unit meet the equalities.
-    """
+    """Return y of the minimum pi = near + unit y, stated as a cone programme."""
+    # log det J is the largest sum t_i, t_i <= log Z_ii, of a lower triangle Z for which [[J, Z],
+    # [Z^T, diag(Z_ii)]] is positive semidefinite. J is in units of that of near, and the columns of
+    # unit meet the equalities.
     penalty, (p, n) = fit.programme.penalty, (unit.shape[1], len(fit.layout.bodies))
     count, basis = p + 14 * n, pseudo_inertia_basis()
     A, drives = rows[:, :-1] @ fit.K, slice(10 * n, None)

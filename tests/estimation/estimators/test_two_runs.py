@@ -62,10 +62,8 @@ def test_both_runs_are_one_fit_with_the_prior_by_the_noise_of_each_joint(rng, sh
 
 
 def scattered(parts, theta, bread):
-    """Return sum and degrees of freedom of scores of parts (A, b), by matrices of all rows.
-
-    Bell and McCaffrey (2002): residuals over (I - leverage)^(1/2), as if rows were independent.
-    """
+    """Return sum and degrees of freedom of scores of parts (A, b), by matrices of all rows."""
+    # Bell and McCaffrey (2002): residuals over (I - leverage)^(1/2), as if rows were independent.
     A = np.concatenate([X for X, _ in parts])
     residual_maker = np.eye(len(A)) - A @ bread @ A.T
     edges = np.cumsum([0, *(len(X) for X, _ in parts)])

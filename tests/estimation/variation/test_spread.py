@@ -41,10 +41,9 @@ def drawn(rng, unit, between, *, rows=12):
 
 
 def dense(x, error, unit):
-    """Return the posterior by covariance matrices of all runs, at each spread of runs and units.
-
-    Weight, mean of mu, its variance, expected x and their variances (k,), variances of the spread.
-    """
+    """Return the posterior by covariance matrices of all runs, at each spread of runs and units."""
+    # Weight, mean of mu, its variance, expected x and their variances (k,), variances of the
+    # spread.
     several = max(unit) > 0
     within = (0.3 * np.exp(Z[::2])) ** 2 if several else np.zeros(1)
     grid = np.meshgrid(within, (0.3 * np.exp(Z)) ** 2, indexing="ij")

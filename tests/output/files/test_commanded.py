@@ -40,11 +40,9 @@ def commands():
 
 
 def reference(drives, q_ref, *, step=2e-4, settles=0.3):
-    """Return the positions of the closed loop, shape (N, n), by another way than MuJoCo's.
-
-    M dv = dt (clip(kp (q_ref(t - delay) - q) - kd v) - offset - Fv v - c) - friction, implicit in
-    v; each joint's friction is the impulse within +-Fc dt that comes nearest to stopping it.
-    """
+    """Return the positions of the closed loop, shape (N, n), by another way than MuJoCo's."""
+    # M dv = dt (clip(kp (q_ref(t - delay) - q) - kd v) - offset - Fv v - c) - friction, implicit in
+    # v; each joint's friction is the impulse within +-Fc dt that comes nearest to stopping it.
     whole = pin.buildModelFromUrdf(str(example_urdf("go2.urdf")))
     held = [whole.getJointId(name) for name in whole.names[1:] if name not in LEG]
     robot = pin.buildReducedModel(whole, held, pin.neutral(whole))
