@@ -352,8 +352,7 @@ def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
         for j in rows:
             yield Reading("gravity_compensated", (j,), partial(_weightless, on=one[j]))
     timed = Reading("time_scale", every, lambda s, x: s.changed(clock=m.clock * np.exp(x)), (), 0.3)
-    for speed in (0.1, 0.5, 2.0, 10.0):
-        yield replace(timed, values=(float(np.log(speed)),))
+    yield from (replace(timed, values=(float(np.log(x)),)) for x in (0.1, 0.5, 2.0, 10.0))
     branches, singles = [tuple(x.tolist()) for x in _branches(model, m.rows)], [(j,) for j in rows]
     legs = branches if len(branches) > 1 else []
     for i, k in combinations((legs if is_gross else ()) if legs else singles, 2):
