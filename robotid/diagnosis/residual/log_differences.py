@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from robotid.base.typing import Array
-from robotid.diagnosis.decisions import BETTER, NOTHING
+from robotid.diagnosis.decisions import BETTER, EXACT, NOTHING
 from robotid.diagnosis.residual.term_trials import Normal, Sample, cut_segments
 
 
@@ -82,7 +82,8 @@ class OtherLogs:
             noise = np.sqrt(_squares(products, change) / np.maximum(rows * share, 1.0))
             scale = np.divide(1.0, noise, out=np.zeros_like(noise), where=noise > 0.0)
             P = np.tensordot(scale**2, products, axes=1)
-            L = np.linalg.cholesky(P[:-1, :-1] + np.eye(len(P) - 1))
+            prior = np.diag(1.0 + EXACT**2 * np.diagonal(P)[:-1])  # beyond the products' rounding
+            L = np.linalg.cholesky(P[:-1, :-1] + prior)
             change = np.linalg.solve(L.T, np.linalg.solve(L, P[:-1, -1]))
         return cls(is_out, change, L, scale, share)
 
