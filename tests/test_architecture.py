@@ -179,13 +179,10 @@ def test_the_package_shows_its_public_api_and_nothing_else():
         _ = robotid.OLS
 
 
-def all_modules():
-    names = [m.name for m in pkgutil.walk_packages([str(PACKAGE)], "robotid.")]
-    return [importlib.import_module(name) for name in names if not name.endswith("__main__")]
-
-
 def test_every_module_says_what_it_is_for():
-    assert not [module.__name__ for module in all_modules() if not module.__doc__]
+    names = [m.name for m in pkgutil.walk_packages([str(PACKAGE)], "robotid.")]
+    modules = [importlib.import_module(name) for name in names if not name.endswith("__main__")]
+    assert not [module.__name__ for module in modules if not module.__doc__]
 
 
 def public_names():

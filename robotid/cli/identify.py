@@ -342,7 +342,7 @@ def identify_job(
     recordings = Recordings(model, structural_mapping(model), fitted, validation)
     if not recordings.is_in_memory:
         recordings = replace(recordings, plan=plan)
-    elif plan.is_asked_for:
+    elif plan.scheduler is not None or (plan.workers or 1) > 1:  # not the defaults
         _log.warning(
             "the logs have at most %d rows and are read whole: workers and scheduler have no "
             "effect. Reduce rows_in_memory in [reduction] to read the logs in pieces",

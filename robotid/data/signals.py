@@ -209,7 +209,8 @@ def _process(part: _Part, segments: Sequence[Segment]) -> Trajectory:
     t, q, v, a, tau, direction, wrenches = map(np.concatenate, zip(nothing, *moving, strict=True))
     contacts, switching = _contacts(log, t, settings) if log.contacts else (None, None)
     if log.base is not None and log.base.imu is None and len(t):
-        jumping = _jumping(log.t, log.base.pose, t, settings)
+        rows, reach = pose_jumps(log.t, log.base.pose)[0], _JUMPS * _time_constant(settings)
+        jumping = _are_within(t, log.t, rows - 1 - _BESIDE, rows + _BESIDE, reach)
         switching = jumping if switching is None else switching | jumping
     counts = [len(motion[0]) if motion else 0 for motion in motions]
     return Trajectory(
@@ -344,12 +345,6 @@ def _contacts(log: Log, t: Array, settings: SignalSettings) -> tuple[Array, Arra
     flags = np.column_stack(list(log.contacts.values()))
     rows = np.flatnonzero((flags[1:] != flags[:-1]).any(axis=1))
     return touching, _are_within(t, log.t, rows, rows + 1, reach)
-
-
-def _jumping(stamps: Array, pose: Array, t: Array, settings: SignalSettings) -> Array:
-    """Return the times (N,) at which a jump of the pose of the base is in its motion, bool."""
-    rows, reach = pose_jumps(stamps, pose)[0], _JUMPS * _time_constant(settings)
-    return _are_within(t, stamps, rows - 1 - _BESIDE, rows + _BESIDE, reach)
 
 
 def _are_within(t: Array, stamps: Array, first: Array, last: Array, reach: float) -> Array:

@@ -339,7 +339,12 @@ def preview_logs(
             "robot with a fixed base"
         )
     mapping = structural_mapping(model)
-    motions = [_with_torque(motion) for motion in motions]
+    motions = [  # with torques: rows of joints without them would not be used
+        hold_log(x.model, replace(x.source, has_torque=True), x.asked, x.locked)
+        if x.model.constraints and isinstance(x.source, Log)
+        else x
+        for x in motions
+    ]
     peak, fastest = _largest(model, motions)
     size = largest_torques(model, peak)
     earlier = run or like
@@ -456,13 +461,6 @@ def _largest(model: RobotModel, motions: Sequence[SurveyedLog]) -> tuple[Array, 
     peak = np.max(torques, axis=0)
     first = model.n_rows - len(model.joints)
     return peak[first:], fastest[first:]
-
-
-def _with_torque(log: SurveyedLog) -> SurveyedLog:
-    """Return a motion whose joints will have torques: without, their rows would not be used."""
-    if log.model.constraints and isinstance(log.source, Log):
-        return hold_log(log.model, replace(log.source, has_torque=True), log.asked, log.locked)
-    return log
 
 
 def _errors(

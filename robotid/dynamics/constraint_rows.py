@@ -254,4 +254,5 @@ def measured_rows(model: RobotModel) -> list[int]:
     """Return the rows of the Jacobian whose forces are measured."""
     edges = np.cumsum([0, *(x.sizes[x.kind] for x in model.constraints)]).tolist()
     pairs = zip(model.constraints, edges, strict=False)
-    return [first + k for x, first in pairs if isinstance(x, Contact) for k in x.rows_measured]
+    contacts = [(x, first) for x, first in pairs if isinstance(x, Contact)]
+    return [first + x.components.index(y) for x, first in contacts for y in x.measured]

@@ -88,11 +88,6 @@ class WorkPlan:
         if self.workers is not None:
             self._size = require_workers(self.workers)
 
-    @property
-    def is_asked_for(self) -> bool:
-        """Whether settings differ from the defaults; short logs have no use for them."""
-        return self.scheduler is not None or (self.workers or 1) > 1
-
     def __enter__(self) -> Self:
         self._reuses = True
         return self

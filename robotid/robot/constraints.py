@@ -91,11 +91,6 @@ class Contact(Settings):
         return f"contact {self.frame!r}"
 
     @property
-    def rows_measured(self) -> list[int]:
-        """Indices of the measured components."""
-        return [self.components.index(component) for component in self.measured]
-
-    @property
     def frames(self) -> tuple[str, ...]:
         """The link."""
         return (self.frame,)

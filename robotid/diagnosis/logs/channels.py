@@ -54,13 +54,13 @@ def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
     noise = {kind: _white_noise(log.t, values) for kind, values in channels.items()}
     for kind, values in channels.items():
         yield from _quantisation(log, kind, values, signals.velocity)
-    for kind, values in channels.items():
+        yield from _noise(log, kind, values, noise[kind])
         is_used = kind != "dq" or signals.velocity == "measured"
         is_used = is_used or (signals.velocity == "auto" and units.is_trustworthy(log))
         yield from _spikes(log, kind, values, noise[kind], is_used=is_used)
-    for kind, values in channels.items():
-        yield from _noise(log, kind, values, noise[kind])
-    if log.v is not None:
+    wrong = [*_jumps(log), *_stuck(log)]
+    yield from wrong
+    if log.v is not None and not wrong:
         moved, integral = units.displacements(log, log.v)
         exchanged = list(_velocity_order(log, moved, integral))
         yield from exchanged
@@ -121,6 +121,40 @@ def _spikes(
             severity="error" if is_harmful else "note", rows=len(rows), largest=largest,
             energy_share=energy, first=first, when=seconds(first),
         )  # fmt: skip
+
+
+def _jumps(log: Log) -> Iterator[Finding]:
+    """Yield positions that jump between two rows: of a joint, or of all where rows are missing."""
+    from scipy.ndimage import median_filter  # takes long to import
+
+    step = np.diff(log.t)
+    smooth = median_filter(np.unwrap(log.q, axis=0), size=(5, 1), mode="nearest")
+    change = np.diff(smooth, axis=0) * (step < GAP_STEPS * np.median(step))[:, None]
+    usual = median_filter(change, size=(5, 1), mode="nearest")
+    fast = np.quantile(np.abs(usual), 0.995, axis=0)
+    jumps = np.abs(change - usual) > np.maximum(STILL, SIGNIFICANT * fast)  # (N - 1, n)
+    together = jumps.sum(axis=1) > 1
+    places = {joint: jumps[:, j] for j, joint in enumerate(log.joints)}
+    if together.sum() > BETTER * jumps.any(axis=1).sum():
+        places = {"": together}  # of all joints
+    for joint, is_jump in places.items():
+        if len(rows := np.flatnonzero(is_jump) + 1):
+            figures = {"what": bool(joint), "rows": len(rows), "first": log.t[rows[0]]}
+            yield finding("position_jump", log.name, (joint,) * bool(joint), **figures)
+
+
+def _stuck(log: Log) -> Iterator[Finding]:
+    """Yield positions that stop abruptly and are exactly constant, but differ in all other rows."""
+    is_same = np.diff(log.q, axis=0) == 0
+    for j, joint in enumerate(log.joints):
+        runs = runs_of(is_same[:, j])
+        first, last = max(runs, key=lambda run: run[1] - run[0], default=(0, 0))
+        share, others = (last - first) / len(log.t), is_same[:, j].sum() - (last - first)
+        if share < SHARE_OF_ROWS or others > ZERO * (last - first) or is_same[first:last].all():
+            continue
+        q = log.q[max(first - _AROUND, 0) : first + 1, j]
+        if first >= _AROUND and 3 * abs(q[-1] - q[-4]) > BETTER * abs(q[-1] - q[0]):
+            yield finding("stuck_position", log.name, joint, start=log.t[first], share=share)
 
 
 def _noise(log: Log, kind: str, values: Array, noise: Array) -> Iterator[Finding]:
@@ -345,7 +379,11 @@ def _rate(log: Log, step: Array, median: float) -> Iterator[Finding]:
 
 def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
     every = np.flatnonzero(step > GAP_STEPS * median * (1 + 1e-6)).tolist()
-    jumps = [k for k in every if step[k] > _PAUSE and _goes_on(log.q, k)]
+    q, jumps = log.q, list[int]()
+    for k in (k for k in every if step[k] > _PAUSE and 2 <= k < len(q) - 3):
+        around = (q[k] - q[k - 2] + q[k + 3] - q[k + 1]) / 4  # change between two rows
+        if np.linalg.norm(q[k + 1] - q[k] - around) < BETTER * np.linalg.norm(around):
+            jumps.append(k)
     if jumps:
         jump, at = step[jumps[0]] - median, log.t[jumps[0]]
         yield finding("clock_step", log.name, jump=jump, at=at, steps=len(jumps))
@@ -376,15 +414,6 @@ def _bunches(log: Log, step: Array) -> Iterator[Finding]:
         severity="error" if share > BETTER else "warning",
         cure=bool((np.abs(log.t - even) <= pause).all()),
     )  # fmt: skip
-
-
-def _goes_on(q: Array, k: int) -> bool:
-    """Return whether the position moves from row k to k + 1 as far as in the steps around."""
-    if not 2 <= k < len(q) - 3:
-        return False
-    around = (q[k] - q[k - 2] + q[k + 3] - q[k + 1]) / 4
-    change, size = q[k + 1] - q[k], float(np.linalg.norm(around))
-    return size > 0 and float(np.linalg.norm(change - around)) < 0.5 * size
 
 
 def _stale_rows(log: Log, step: Array) -> Iterator[Finding]:

@@ -16,8 +16,8 @@ from robotid.base.tolerances import TINY
 from robotid.base.typing import Array
 from robotid.data.log import REPEATED, Log, Trajectory, repeated_share
 from robotid.data.signal_settings import LogUnits, SignalSettings
-from robotid.data.units import AT_REST, STILL
-from robotid.diagnosis.catalogue import finding
+from robotid.data.units import AT_REST, STATIC, STILL
+from robotid.diagnosis.catalogue import codes_with, finding
 from robotid.diagnosis.decisions import BETTER, NOTHING, ROWS, SCATTERED, SEGMENTS, ZERO
 from robotid.diagnosis.explanations import explained
 from robotid.diagnosis.logs import channels
@@ -34,8 +34,6 @@ from robotid.estimation.estimators import WLS, Estimate, determination
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread, with_assumed_inertials
 
-#: Errors of channels after which no model fits the torques.
-_FIT_NO_MODEL = ("time_scale", "unsigned_torque", "constant_torque")
 _FAR = 2 * np.pi  # number in a log above which a position may be a percentage
 
 
@@ -51,6 +49,8 @@ def diagnose(
     _examine_torques(model, [one for one in examined if one.is_tried and is_possible], signals)
     findings = [*assumed, *(x for one in examined for x in one.findings)]
     first = [one.motion for one in examined[: len(fitted)] if one.motion is not None]
+    moved = {x for m in first for j, x in enumerate(model.joints) if np.ptp(m.q[:, j]) >= STATIC}
+    findings = [x for x in findings if x.code != "static_joint" or not moved >= {*x.joints}]
     probes = [x.probe for x in examined[: len(fitted)] if x.probe and not model.constraints]
     mapping = structural_mapping(model) if probes else None
     for k, log in enumerate(fitted):
@@ -126,7 +126,7 @@ def _examine_log(model: RobotModel, log: Log, signals: SignalSettings) -> _Exami
     if one.probe is None:
         findings.append(finding("no_motion", name))
     codes = {x.code for x in findings if x.severity == "error"}
-    one.is_tried = codes.isdisjoint(_FIT_NO_MODEL)
+    one.is_tried = codes.isdisjoint(codes_with("fits_no_model"))
     return one
 
 

@@ -351,8 +351,8 @@ def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
         yield Reading("static_torque", every, lambda s: s.changed(inertia=np.zeros(n)))
         for j in rows:
             yield Reading("gravity_compensated", (j,), partial(_weightless, on=one[j]))
-    for speed in (0.1, 0.5, 2.0, 10.0):
-        yield Reading("time_scale", every, _timed, (float(np.log(speed)),), 0.3)
+    timed = Reading("time_scale", every, lambda s, x: s.changed(clock=m.clock * np.exp(x)), (), 0.3)
+    yield from (replace(timed, values=(float(np.log(x)),)) for x in (0.1, 0.5, 2.0, 10.0))
     branches, singles = [tuple(x.tolist()) for x in _branches(model, m.rows)], [(j,) for j in rows]
     legs = branches if len(branches) > 1 else []
     for i, k in combinations((legs if is_gross else ()) if legs else singles, 2):
@@ -398,10 +398,6 @@ def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
 
 def _negated(samples: Samples, on: Array) -> Samples:
     return replace(samples, sign=samples.sign * (1.0 - 2.0 * on))
-
-
-def _timed(samples: Samples, log_speed: float) -> Samples:
-    return samples.changed(clock=samples.motion.clock * np.exp(log_speed))
 
 
 def _falling(samples: Samples, *direction: float) -> Samples:

@@ -53,6 +53,7 @@ class Reading:
     #: Robot and motions with sizes (c,), where torques are nonlinear in them.
     applied: Callable[[Array, Array], _Altered] | None = None
     changes: bool = False  # whether its sizes change in time
+    is_positive: bool = False  # whether only a positive size is possible
 
 
 def readings(model: RobotModel, pi: Array, sample: Sample) -> tuple[Reading, ...]:
@@ -72,7 +73,7 @@ def _of_recordings(
     of_bodies = (by.by_q, by.by_v, by.by_a)
     by_motion = [D + _drive_slopes(model, pi, at, x) for D, x in zip(of_bodies, "qva", strict=True)]
     q, v, a = (np.concatenate([getattr(m, key) for m in at]) for key in "qva")
-    recorded = zip(sample.recordings, sample.taken, strict=True)
+    recorded = [*zip(sample.recordings, sample.taken, strict=True)]
     jerk = np.concatenate([torque_rate(x.trajectory.a, x.trajectory)[k] for x, k in recorded])
     direction = np.column_stack([motion.direction for motion in sample.motions])
 
@@ -85,18 +86,36 @@ def _of_recordings(
         """Return the derivative of the torques for positions (1 + e scale) q + e shift by e."""
         return changed(scale * q + shift, scale * v, scale * a)
 
+    def with_rates(motion: Trajectory) -> Array:
+        """Return the torques of the bodies and two derivatives by time, (3, N, n)."""
+        rates = [inverse_dynamics(model, _bodies(model, pi), motion)]
+        for _ in range(2):
+            rates.append(torque_rate(rates[-1], motion))
+        return np.stack(rates)
+
     def offset(on: Array, x: Array) -> _Altered:
         return model, [replace(m, q=m.q + x * on) for m in at]
 
     late = -changed(v, a, jerk)  # (N, n, 1)
+    load = np.concatenate([with_rates(x.trajectory)[:, k] for x, k in recorded], axis=1)
+    load /= np.maximum(np.sqrt(np.mean(load[0] ** 2, axis=0)), decisions.NOTHING)
+    side = np.tanh(load[0] / decisions.ZERO)  # of the gear that is loaded
     one, every = [(joint,) for joint in joints], [tuple[str, ...]()]
+    mean, most = side[: sample.rows].mean(axis=0), 1 - 2 * decisions.SHARE_OF_ROWS
+    both_sides = [x for x, is_both in zip(one, np.abs(mean) < most, strict=True) if is_both]
     driven = [(joint,) for joint, size in zip(joints, sample.torque, strict=True) if size]
     wrists = [joints[first:] for first in range(1, len(joints) - 1)]  # with drives of one type
     return (
         Reading("position_offset", 0.01, one, lambda on: moved(0 * on, on), offset),
+        Reading("lost_motion", 0.005, one, lambda on: 0.5 * moved(0 * on, direction * on)),
         Reading(
-            "lost_motion", 0.005, one,
-            lambda on: 0.5 * moved(0 * on, on) * (direction @ on)[:, None, None],
+            "lost_motion:load", 0.005, both_sides,
+            lambda on: 0.5 * moved(0 * on, side * on),
+        ),
+        Reading(
+            "joint_elasticity", 0.0, one,
+            lambda on: -sum(D @ x[..., None] for D, x in zip(of_bodies, load * on, strict=True)),
+            is_positive=True,
         ),
         Reading("angle_scale", 0.02, one + every, lambda on: moved(on, 0 * on)),
         Reading("torque_scale", 0.05, driven + wrists, lambda on: (tau * on)[..., None]),
@@ -209,14 +228,14 @@ class _Alteration:
         residual: dict[str, float | str] = {"what": "residual", "cure": "residual"}
         factor: dict[str, float | str] = {"factor": 1 + x[0]}
         values: dict[str, dict[str, float | str]] = {
-            "position_offset": {"correction": -x[0], "unit": unit},
-            "lost_motion": {"unit": unit},
+            "position_offset": {"correction": -x[0]},
             "angle_scale": factor | residual | {"named": position},
             "torque_scale": factor | {"what": sense, "cure": sense},
             "time_scale": factor | residual | {"speed": np.sqrt(max(1 + x[0], 0.0))},
             "external_force": {"what": "constant", "cure": "constant"},
         }
-        more: dict[str, float | str] = {"named": ", ".join(self.joints) or "all joints"}
+        named = ", ".join(self.joints) or "all joints"
+        more: dict[str, float | str] = {"named": named, "unit": unit}
         more, applied = more | values.get(self.reading.code, {}), self.reading.applied
         if applied is not None:
             more |= residual
@@ -398,6 +417,8 @@ def _accepted(
 ) -> Iterator[tuple[_Alteration, Finding, Sample]]:
     """Yield the alterations that explain the residual, findings, and the corrected samples."""
     trials, offered = Trials.of(sample, possible)
+    sizes = trials.whole.parameters_each(offered)
+    offered = {x: k for x, k in offered.items() if not x.reading.is_positive or sizes[x][0] > 0.0}
     rule = replace(decisions.ALTERATION, alike=decisions.AGREES) if log else decisions.ALTERATION
     # the simplest of those alike has the fewest sizes, then joints
     series = trials.accepted(offered, rule, lambda one: (len(offered[one]), len(one.joints)))

@@ -223,13 +223,10 @@ def _windup(m: JointMotion) -> Array:
 
 def _coupled(m: JointMotion, other: str, ratio: float) -> Array:
     """Return columns of a drive at the speed w = v + ratio v' of both joints, at the first."""
-
-    def drive_speed(motion: JointMotion) -> Array:
-        return motion.v + ratio * motion.others[other].v if other in motion.others else motion.v
-
+    speed = _sense(m, lambda x: x.v + ratio * x.others[other].v if other in x.others else x.v)
     partner, rest = m.others.get(other), np.zeros_like(m.v)
     own = (rest, rest) if partner is None else (partner.a, partner.v)
-    return np.column_stack([*own, _sense(m, drive_speed)])
+    return np.column_stack([*own, speed])
 
 
 #: The candidates of each joint, without couplings and ripples, an entry each.

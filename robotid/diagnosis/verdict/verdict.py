@@ -529,9 +529,9 @@ def _warnings(finding: Finding, joints: Sequence[str]) -> Iterator[VerdictWarnin
         "constraint_costs": costs > COSTLY,
         "current_for_torque": max(factor, 1.0 / factor) > NO_ERROR_OF_MASSES,
     }.get(finding.code, False)
-    for joint in named:
+    for joint in named or (joints if is_poor else ()):
         yield VerdictWarning(finding.code, joint, message, "poor" if is_poor else "usable")
-    if not named:
+    if not (named or is_poor):
         where = finding.log or finding.where
         where = "" if finding.where in _OF_THE_FIT else f"{where}: "
         yield VerdictWarning(finding.code, "", f"{where}{message}")

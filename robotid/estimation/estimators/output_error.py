@@ -129,7 +129,7 @@ class OutputError(Estimator[Simulator]):
         """Return the last weights, the parameters, and how they were found."""
         initial = simulator.prior if start is None else start
         theta = np.clip(np.array(initial, dtype=float), *simulator.bounds)
-        residuals = self._left(simulator, theta)
+        residuals = self._residuals(simulator, theta)
         weights, rounds, count, converged = self._weigh(residuals, self.frees), 0, 0, False
         for rounds in range(1, self.rounds + 1):
             close = _ROUGH if rounds == 1 else _CLOSE
@@ -149,9 +149,9 @@ class OutputError(Estimator[Simulator]):
 
     def weights(self, simulator: Simulator, theta: Array) -> "_Weights":
         """Return correlation and noise level of the residuals at parameters (c,)."""
-        return self._weigh(self._left(simulator, theta), self.frees)
+        return self._weigh(self._residuals(simulator, theta), self.frees)
 
-    def _left(self, simulator: Simulator, theta: Array) -> Sequence[Residual]:
+    def _residuals(self, simulator: Simulator, theta: Array) -> Sequence[Residual]:
         """Return residuals; with derivatives by the initial states only if these are free."""
         return simulator.residuals(theta, with_slopes=False, with_starts=self.frees)
 
@@ -190,7 +190,7 @@ class OutputError(Estimator[Simulator]):
         H, g = self.normal(simulator, self.weights(simulator, theta), theta, frees=True)
         moved = _bounded_step(H, g, theta, simulator.bounds, _CAUTIOUS)
         try:
-            self._left(simulator, moved)
+            self._residuals(simulator, moved)
         except NotConvergedError:
             return theta
         return moved
@@ -202,7 +202,7 @@ class OutputError(Estimator[Simulator]):
         weights, theta = self._weigh(residuals, frees=True), estimate.theta
         how = {key: getattr(estimate, key) for key in ("converged", "n_iter", "message")}
         settled = self._estimate(simulator, weights, theta, residuals, how, moves=True)
-        self._left(simulator, settled.theta)  # raises NotConvergedError if it fails
+        self._residuals(simulator, settled.theta)  # raises NotConvergedError if it fails
         return settled
 
     def moved(self, simulator: Simulator, other: Simulator, theta: Array) -> tuple[Array, Array]:
@@ -244,7 +244,7 @@ class OutputError(Estimator[Simulator]):
                 trial = _bounded_step(H, g, theta, simulator.bounds, damping)
                 left, new = residuals, np.inf
                 try:
-                    left = self._left(simulator, trial)
+                    left = self._residuals(simulator, trial)
                     new = self._cost(simulator, weights, trial, left)
                 except NotConvergedError:
                     pass  # the step is too long
@@ -277,12 +277,12 @@ class OutputError(Estimator[Simulator]):
         change = np.zeros_like(theta)
         if moves:
             change = _bounded_step(H, g, theta, simulator.bounds, _NEARLY_FREE) - theta
-        known = 1.0 / simulator.prior_std**2
+        precision = 1.0 / simulator.prior_std**2
         scale = 1.0 / np.sqrt(np.diag(H))
         values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
         bread = (vectors / np.maximum(values, 1e-13)) @ vectors.T * np.outer(scale, scale)
         segments = _segments(parts, len(theta), are_windows=self.frees)
-        meat, inflation, freedom = H - np.diag(known), 1.0, np.full(len(theta), np.inf)
+        meat, inflation, freedom = H - np.diag(precision), 1.0, np.full(len(theta), np.inf)
         if len(segments) >= FEWEST_SEGMENTS:
             scores = scatter(segments, change, np.ones(1), bread)
             inflation, freedom = scores.inflation, scores.freedom()
@@ -290,13 +290,13 @@ class OutputError(Estimator[Simulator]):
             meat = scores.meat + further.T @ further
         # standard errors are at least those for independent rows
         independent = np.diag(bread @ H @ bread.T)
-        gained = 1.0 - independent * known  # relative reduction of each prior variance
+        gained = 1.0 - independent * precision  # relative reduction of each prior variance
         names, theta = np.array(simulator.names), theta + change
         undetermined = tuple(names[gained < TINY].tolist())
         at_bound = tuple(names[is_at_bound(simulator, theta)].tolist())
         return Estimate(
             theta=theta,
-            covariance=at_least(sandwich(bread, meat + np.diag(known)), independent),
+            covariance=at_least(sandwich(bread, meat + np.diag(precision)), independent),
             names=simulator.names,
             sigma=weights.sigma / np.sqrt(self.inflation),
             rank=len(theta) - len(undetermined),
@@ -315,8 +315,8 @@ def _summed(
     simulator: Simulator, theta: Array, parts: Iterable[tuple[Array, Array, Array]]
 ) -> tuple[Array, Array]:
     """Return H = A'A and A'b of linearised rows, additional rows and the prior included."""
-    tau = 1.0 / simulator.prior_std**2
-    H, g = np.diag(tau), tau * (simulator.prior - theta)
+    precision = 1.0 / simulator.prior_std**2
+    H, g = np.diag(precision), precision * (simulator.prior - theta)
     for A, b, columns in parts:
         H[np.ix_(columns, columns)] += A.T @ A
         g[columns] += A.T @ b

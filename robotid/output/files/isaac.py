@@ -69,7 +69,8 @@ def isaac_actuators(
         groups.setdefault(yaml_text(fields, ""), (fields, []))[1].append(drive.joint)
     actuators: dict[str, Any] = {}
     for fields, joints in groups.values():
-        name = _group_name(joints)
+        words = [joint.split("_") for joint in joints]  # those in common
+        name = "_".join(w for w in words[0] if all(w in own for own in words)) or "drives"
         while name in actuators:
             name += "_"
         actuators[name] = {"joint_names_expr": [re.escape(joint) for joint in joints], **fields}
@@ -94,9 +95,3 @@ def _fields(drive: CommandedDrive, joint: Joint, physics_dt: float) -> dict[str,
 
 def _limit(value: float) -> float | None:
     return value if 0 < value < math.inf else None
-
-
-def _group_name(joints: Sequence[str]) -> str:
-    """Return the words that the names of joints have in common."""
-    words = [set(joint.split("_")) for joint in joints]
-    return "_".join(w for w in joints[0].split("_") if all(w in own for own in words)) or "drives"

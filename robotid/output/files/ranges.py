@@ -131,8 +131,10 @@ def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
         drive, _, term = entry["name"].rpartition(".")
         error = entry.get("std_error")
         reach = entry.get("quantile") or QUANTILE
+        source = entry.get("source", "stated" if error is None else "data")
+        source = "bound" if entry.get("at_bound") else str(source)
         ends = _range(
-            entry["value"], math.inf if error is None else error, source_of(entry), reach,
+            entry["value"], math.inf if error is None else error, source, reach,
             _least(term), is_positive=term == "kp",
         ) | {"unit": entry["unit"]}  # fmt: skip
         ends = ranges["drives"].get(drive, {}).get(term, ends)
@@ -175,12 +177,6 @@ def _body(pi: Array, covariance: Array, sources: Sequence[str], quantile: float)
         "second_moments": dict(zip("xyz", rest[3:6], strict=True)),
         "principal_moments": dict(zip(("Ixx", "Iyy", "Izz"), rest[6:], strict=True)),
     }
-
-
-def source_of(entry: Mapping[str, Any]) -> str:
-    """Return the source of a parameter of a result, also for results that do not state it."""
-    found = "stated" if entry.get("std_error") is None else "data"
-    return "bound" if entry.get("at_bound") else str(entry.get("source", found))
 
 
 def _range(

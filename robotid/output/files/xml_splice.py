@@ -30,11 +30,6 @@ class Element:
     end: int  # first byte after the element
     children: tuple["Element", ...]  # the elements directly inside
 
-    @property
-    def is_self_closing(self) -> bool:
-        """Whether it is written as ``<tag/>``."""
-        return self.inside == self.end
-
     def find_all(self, tag: str) -> tuple["Element", ...]:
         """Return the elements of one name directly inside, in the order of the file."""
         return tuple(child for child in self.children if child.tag == tag)
@@ -103,7 +98,7 @@ def insert(document: Document, parent: Element, lines: Sequence[str]) -> Edit:
     else:
         at, indent = parent.inside, None if outer is None else outer + _unit(document)
     text = _line_break(document, indent) + _layout(document, lines, indent)
-    if not parent.is_self_closing:
+    if parent.inside != parent.end:  # not <tag/>
         return Edit(at, at, text)
     closing = _line_break(document, outer) + b"</" + parent.tag.encode() + b">"
     return Edit(parent.end - 2, parent.end, b">" + text + closing)

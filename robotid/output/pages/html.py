@@ -358,7 +358,9 @@ def chart_html(chart: Chart, caption: str, *, points: int = POINTS) -> str:
     order = np.argsort(chart.x, kind="stable")
     x = np.asarray(chart.x, dtype=float)[order]
     lines = [(s, _sorted(s.y, order), _sorted(s.half, order)) for s in chart.series]
-    rows = _union([y for _, y, _ in lines], points, len(x))
+    rows, most = np.arange(len(x)), max(points // max(len(lines), 1), 8)
+    if len(x) > points:
+        rows = np.unique(np.concatenate([thin(y, most) for _, y, _ in lines]))
     series = [
         {**vars(s), "y": _axis(y[rows], chart, "y"),
          "half": None if half is None else stepped(half[rows])}
@@ -415,13 +417,6 @@ def _axis(values: Array, chart: Chart, axis: str, kind: str = "<u2") -> dict[str
 
 def _sorted(values: Array | None, order: NDArray[np.int_]) -> Any:  # noqa: ANN401
     return None if values is None else np.asarray(values, dtype=float)[order]
-
-
-def _union(lines: Sequence[Array], points: int, count: int) -> NDArray[np.int_]:
-    if count <= points:
-        return np.arange(count)
-    share = max(points // len(lines), 8)
-    return np.unique(np.concatenate([thin(y, share) for y in lines]))
 
 
 def packed(values: Array, kind: str = "<f4") -> dict[str, Any]:

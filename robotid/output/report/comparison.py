@@ -115,8 +115,9 @@ def _require_same_mapping(
     ours, theirs = (
         {
             entry["name"]: entry["expression"]
-            for entry in result["base_parameters"]
-            if not _is_chosen(entry["name"], result)
+            for drives in [{entry["name"] for entry in result["drive_parameters"]}]
+            for entry in result["base_parameters"]  # without friction terms that were selected
+            if entry["name"] not in drives or entry["name"].rpartition(".")[2] in TERMS
         }
         for result in (one, other)
     )
@@ -136,12 +137,6 @@ def _require_same_mapping(
             f"{len(changed)} base parameters have other expressions in {first} and {second}: "
             f"{listed(changed, 5)}; {name} is {ours[name]} and {theirs[name]}; {what}"
         )
-
-
-def _is_chosen(name: str, result: Mapping[str, Any]) -> bool:
-    """Return whether a parameter is a friction term that some results may not have."""
-    drives = {entry["name"] for entry in result["drive_parameters"]}
-    return name in drives and name.rpartition(".")[2] not in TERMS
 
 
 def _recordings(result: Mapping[str, Any], role: str) -> tuple[tuple[Any, ...], ...]:

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 from robotid.base.findings import Cause, grouped, listed, toml_key
 from robotid.base.settings import is_number
 from robotid.data.units import STILL
+from robotid.diagnosis.catalogue import codes_with, step_of
 from robotid.diagnosis.catalogue import entries as catalogue_entries
-from robotid.diagnosis.catalogue import step_of
 from robotid.diagnosis.residual.misfit import setting_of, with_entries
 from robotid.diagnosis.verdict.verdict import GOOD, is_beaten
 from robotid.estimation.fitting.fit import pinned_joints
@@ -148,7 +148,9 @@ def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
     by_step: dict[str, list[Cause]] = {}
     findings = [finding for finding in found.findings if finding.severity != "note"]
     causes = [*grouped(findings, found.model.joints), *_of_verdict(found)]
-    named = {j for c in causes if c.severity != "note" and _names_cause(c) for j in c.joints}
+    causal = {c.code for c in causes if step_of(c.code) in ("terms", "as_found")}
+    causal.update(codes_with("names_cause"))
+    named = {j for c in causes if c.severity != "note" and c.code in causal for j in c.joints}
     for cause in causes:
         if cause.code in _UNNAMED and named.intersection(cause.joints):
             # the named cause of these joints has a step of its own
@@ -213,11 +215,6 @@ def _of_verdict(found: TorqueIdentification) -> list[Cause]:
         severity = "warning" if found.scale_check.contradicts else "note"
         causes.append(Cause("scale_unchecked", severity, (), (), ()))
     return causes
-
-
-def _names_cause(cause: Cause) -> bool:
-    names_cause = catalogue_entries().get(cause.code, {}).get("names_cause", False)
-    return names_cause or step_of(cause.code) in ("terms", "as_found")
 
 
 def _named(causes: Sequence[Cause], default: Sequence[str] = ()) -> str:

@@ -428,6 +428,25 @@ def test_a_position_that_is_held_between_steps_is_not_stale():
     assert found.evidence["longest_run"] == 3
 
 
+def test_a_position_that_jumps_or_is_stuck_is_an_error_of_its_joint_or_of_all_if_rows_are_lost():
+    t, rng = 0.01 * np.arange(2000), np.random.default_rng(0)
+    q = np.sin(np.outer(t, [1.0, 1.7])) + 1e-5 * rng.standard_normal((2000, 2))
+
+    def errors(q):
+        log = Log(t[: len(q)], q=q, tau=q, joints=("a", "b"), path="run.csv")
+        every = check_channels(log, SignalSettings())
+        return [(x.code, x.joints, Figures(x)) for x in every if x.severity == "error"]
+
+    assert errors(q) == []
+    late = (t > 8.0)[:, None]
+    slip = {"rows": 1, "first": pytest.approx(8.01)}
+    assert errors(q + 0.3 * (late & [True, False])) == [("position_jump", ("a",), slip)]
+    lost = np.delete(q, np.r_[500:540, 900:930], axis=0)
+    assert errors(lost) == [("position_jump", (), {"rows": 2, "first": pytest.approx(5.0)})]
+    stuck = {"start": pytest.approx(8.0), "share": pytest.approx(0.6, abs=0.001)}
+    assert errors(np.where(late & [False, True], q[800], q)) == [("stuck_position", ("b",), stuck)]
+
+
 @pytest.fixture(scope="module")
 def slider():
     """A prismatic joint and one that turns."""

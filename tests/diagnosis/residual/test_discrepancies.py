@@ -118,6 +118,27 @@ def test_what_is_stated_wrongly_is_named_with_its_size(
         assert f"the time stamps run {faster:.3f} times as fast" in first.message
 
 
+@pytest.mark.parametrize(("code", "size"), [("joint_elasticity", 0.05), ("lost_motion", 0.06)])
+def test_a_gear_behind_its_encoder_that_yields_or_has_play_is_named(model, code, size):
+    t, logs = np.arange(0.0, 20.0, 0.005), []
+    for part in (0, 1):
+        rng = np.random.default_rng(part)
+        f, phase = rng.uniform(0.1, 0.6, (5, 1, 6)), rng.uniform(0.0, 7.0, (5, 1, 6))
+        q = 0.35 * np.sin(2 * np.pi * f * t[:, None] + phase).sum(axis=0)
+        v = np.gradient(q, t, axis=0)
+        motion, robot = zip(q, v, np.gradient(v, t, axis=0), strict=True), model.pin_model
+        load = np.array([pin.rnea(robot, robot.createData(), *x) for x in motion])
+        ratio = load / np.sqrt(np.mean(load**2, axis=0))
+        yields = ratio if code == "joint_elasticity" else 0.5 * np.tanh(load)
+        q += on(model, "elbow_joint", size * yields, 0.0)
+        tau = load + 0.5 * v + 0.01 * rng.standard_normal(v.shape)
+        logs.append(Log(t, q, tau, model.joints, path=f"run{part}.csv"))
+    fit = fitted(model, logs)
+    first = explain_residual(fit, take_sample(fit))[1][0]
+    assert (first.code, first.where) == (code, "elbow_joint")
+    assert abs(first.evidence["size"]) == pytest.approx(size, rel=0.25)
+
+
 def test_columns_are_derivatives_of_the_torque(model):
     logs = [log_with(model, 3, part=part, rate=50.0, duration=10.0) for part in (0, 1)]
     fit = fitted(model, logs, EstimatorSettings("wls"))
