@@ -232,10 +232,8 @@ def _forces(
 
 
 def _noise_of_groups(J: Array, b: Array, size: float) -> Array:
-    """Return the noise level of rows (n_rows,), of three groups, by restricted maximum likelihood.
-
-    See Searle, Casella, McCulloch (1992), Variance Components, 8.3 (Fisher scoring).
-    """
+    """Return the noise level of rows (n_rows,), of three groups, by restricted likelihood."""
+    # Maximum by Fisher scoring: Searle, Casella, McCulloch (1992), Variance Components, 8.3.
     step, n = max(1, len(b) // _SAMPLES), b.shape[1]
     J, b, weak = J[::step], b[::step], np.eye(J.shape[1]) / (_WIDER * size) ** 2
     group = np.repeat([0, 1, 2], [3, 3, n - 6])

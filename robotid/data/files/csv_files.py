@@ -131,11 +131,13 @@ class _CsvRows(RowReader):
 
     def _no_number(self, name: str, row: int, cell: str) -> DataError:
         hint = "; write decimals with a point" if "," in cell else ""
+        other = "interpolate a column of another rate at the joints' stamps"
         if not cell.strip() and name.startswith(_SENSED):
-            hint = "; interpolate a column of another rate at the joints' stamps"
+            hint = f"; {other}"
+        end = "" if cell.strip() or hint else f", or {other}"
         return DataError(
             f"{self.path.name}: {name} is {repr(cell[:80]) if cell.strip() else 'empty'} at row "
-            f"{row}, expected a number{hint}; remove the row or correct the recording"
+            f"{row}, expected a number{hint}; remove the row or correct the recording{end}"
         )
 
 

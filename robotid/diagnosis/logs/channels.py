@@ -392,7 +392,8 @@ def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
         return
     at = max(gaps, key=lambda k: step[k])
     longest, start = float(step[at]), float(log.t[at])
-    severity = "warning" if longest > _LONG else "note"
+    moved = np.ptp([log.q[gaps], log.q[np.add(gaps, 1)]], axis=0).max(axis=1) > STATIC  # no pause
+    severity = "warning" if (moved & (step[gaps] > _LONG)).any() else "note"
     yield finding("gap", log.name, severity=severity, gaps=len(gaps), longest=longest, at=start)
 
 

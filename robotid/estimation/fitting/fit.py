@@ -444,10 +444,8 @@ def _ground(
 
 
 def _without_regressor_noise(ground: _Ground, choice: EstimatorSettings) -> _Ground:
-    """Return the input with the bias by position quantisation, W shift, subtracted from the torque.
-
-    For estimators that read samples the bias is counted as an error.
-    """
+    """Return the input with the bias by position quantisation, W shift, subtracted from tau."""
+    # For estimators that read samples the bias is counted as an error.
     if isinstance(choice, settings.TLSSettings):
         return ground
     level, theta = ground.rough.sigma, ground.rough.theta

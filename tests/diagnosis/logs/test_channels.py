@@ -363,6 +363,9 @@ def test_gaps_are_counted_and_the_longest_has_its_time():
     assert found["jitter"].evidence["longest"] == pytest.approx(0.012)
     short = said(check_clock(clocked_log(stamps((100, 0.04)))))["gap"]
     assert short.severity == "note"
+    paused = clocked_log(stamps((300, 3600.0)))
+    paused = replace(paused, q=paused.q[np.minimum(np.arange(901), 200)])  # at rest
+    assert said(check_clock(paused))["gap"].severity == "note"
 
 
 def test_a_clock_that_was_set_is_told_from_a_gap_by_the_position():
