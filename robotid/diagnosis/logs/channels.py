@@ -496,6 +496,7 @@ def _clipping(log: Log) -> Iterator[Finding]:
                 along = sign * travel[:, j] > least[:, 0]
                 is_friction = np.sum(at & along) >= MOST * np.sum(along)
                 is_flat = MOST * near < at.sum() and not is_friction  # else a maximum
+                is_flat &= len(runs) > 1  # else one step of friction
                 is_largest = np.ptp(smooth[:, j]) <= 2 * np.max(sign * smooth[:, j]) + 4 * band
                 if is_flat and is_largest and 4 * band < BETTER * np.max(depth):
                     limit = float(np.median(x[at]))
