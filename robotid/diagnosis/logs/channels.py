@@ -58,7 +58,8 @@ def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
         is_used = kind != "dq" or signals.velocity == "measured"
         is_used = is_used or (signals.velocity == "auto" and units.is_trustworthy(log))
         yield from _spikes(log, kind, values, noise[kind], is_used=is_used)
-    wrong = [*_jumps(log), *_stuck(log)]
+    stuck = {x.joints: x for x in _stuck(log)}
+    wrong = [*stuck.values(), *(x for x in _jumps(log) if x.joints not in stuck)]  # as it goes on
     yield from wrong
     if log.v is not None and not wrong:
         moved, integral = units.displacements(log, log.v)
