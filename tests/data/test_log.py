@@ -14,7 +14,6 @@ from robotid.base.exceptions import DataError
 from robotid.data import log as log_module
 from robotid.data.log import Log, Trajectory, blocks_of, map_stamps, median_step
 
-JOINTS = ("shoulder", "elbow")
 T = 1000.0 + np.arange(500) / 100  # 5 s at 100 Hz
 PHASE = T[:, None] * [2.0, 3.0]
 

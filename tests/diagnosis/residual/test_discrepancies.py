@@ -31,12 +31,6 @@ from robotid.robot.model import RobotModel
 sys.path.append(str(ROOT / "benchmarks"))
 from verdict_cases import ROBOTS, build, measured, move
 
-
-@pytest.fixture(scope="module")
-def model():
-    return RobotModel.from_urdf(example_urdf("ur5_robot.urdf"))
-
-
 SETTINGS = EstimatorSettings(prior_weight=1.0)
 
 
@@ -105,10 +99,8 @@ def test_nothing_is_said_of_drives_that_do_more_than_their_model(four, effect):
          "torque_scale", "wrist_1_joint, wrist_2_joint, wrist_3_joint", 0.25, "are at least 1."),
     ],
 )  # fmt: skip
-def test_what_is_stated_wrongly_is_named_with_its_size(
-    model, four, change, code, where, size, words
-):
-    model = four if code in ("angle_scale", "time_scale") else model  # which fewer joints show
+def test_what_is_stated_wrongly_is_named_with_its_size(ur5, four, change, code, where, size, words):
+    model = four if code in ("angle_scale", "time_scale") else ur5  # which fewer joints show
     first = found(model, lambda log: change(log, lambda *args: on(model, *args)))[0]
     assert (first.code, first.where, first.severity) == (code, where, "warning")
     assert first.evidence["size"] == pytest.approx(size, rel=0.25)
@@ -119,48 +111,48 @@ def test_what_is_stated_wrongly_is_named_with_its_size(
 
 
 @pytest.mark.parametrize(("code", "size"), [("joint_elasticity", 0.05), ("lost_motion", 0.06)])
-def test_a_gear_behind_its_encoder_that_yields_or_has_play_is_named(model, code, size):
+def test_a_gear_behind_its_encoder_that_yields_or_has_play_is_named(ur5, code, size):
     t, logs = np.arange(0.0, 20.0, 0.005), []
     for part in (0, 1):
         rng = np.random.default_rng(part)
         f, phase = rng.uniform(0.1, 0.6, (5, 1, 6)), rng.uniform(0.0, 7.0, (5, 1, 6))
         q = 0.35 * np.sin(2 * np.pi * f * t[:, None] + phase).sum(axis=0)
         v = np.gradient(q, t, axis=0)
-        motion, robot = zip(q, v, np.gradient(v, t, axis=0), strict=True), model.pin_model
+        motion, robot = zip(q, v, np.gradient(v, t, axis=0), strict=True), ur5.pin_model
         load = np.array([pin.rnea(robot, robot.createData(), *x) for x in motion])
         ratio = load / np.sqrt(np.mean(load**2, axis=0))
         yields = ratio if code == "joint_elasticity" else 0.5 * np.tanh(load)
-        q += on(model, "elbow_joint", size * yields, 0.0)
+        q += on(ur5, "elbow_joint", size * yields, 0.0)
         tau = load + 0.5 * v + 0.01 * rng.standard_normal(v.shape)
-        logs.append(Log(t, q, tau, model.joints, path=f"run{part}.csv"))
-    fit = fitted(model, logs)
+        logs.append(Log(t, q, tau, ur5.joints, path=f"run{part}.csv"))
+    fit = fitted(ur5, logs)
     first = explain_residual(fit, take_sample(fit))[1][0]
     assert (first.code, first.where) == (code, "elbow_joint")
     assert abs(first.evidence["size"]) == pytest.approx(size, rel=0.25)
 
 
-def test_columns_are_derivatives_of_the_torque(model):
-    logs = [log_with(model, 3, part=part, rate=50.0, duration=10.0) for part in (0, 1)]
-    fit = fitted(model, logs, EstimatorSettings("wls"))
+def test_columns_are_derivatives_of_the_torque(ur5):
+    logs = [log_with(ur5, 3, part=part, rate=50.0, duration=10.0) for part in (0, 1)]
+    fit = fitted(ur5, logs, EstimatorSettings("wls"))
     sample, h, j = take_sample(fit), 1e-5, 2
     pi = np.abs(fit.standard) + 1.0  # large armatures, too
     one = np.eye(6)[j]
     changes = {
         ("angle_scale", ()): lambda m, x: replace(m, q=x * m.q, v=x * m.v, a=x * m.a),
-        ("position_offset", (model.joints[j],)): lambda m, x: replace(m, q=m.q + (x - 1) * one),
-        ("torque_scale", (model.joints[j],)): None,
+        ("position_offset", (ur5.joints[j],)): lambda m, x: replace(m, q=m.q + (x - 1) * one),
+        ("torque_scale", (ur5.joints[j],)): None,
     }
     found = {
         (a.reading.code, a.joints): Z[..., 0]
-        for a, Z in alterations(model, readings(model, pi, sample)).items()
+        for a, Z in alterations(ur5, readings(ur5, pi, sample)).items()
     }
     # gains: of one joint, or of all from one on but the first and the last
-    ends = [model.joints[first:] for first in (1, 2, 3, 4)]
+    ends = [ur5.joints[first:] for first in (1, 2, 3, 4)]
     scaled = {joints for code, joints in found if code == "torque_scale"}
-    assert scaled == {*((joint,) for joint in model.joints), *ends}
+    assert scaled == {*((joint,) for joint in ur5.joints), *ends}
 
     def torques(change, x):
-        return np.concatenate([inverse_dynamics(model, pi, change(m, x)) for m in sample.at])
+        return np.concatenate([inverse_dynamics(ur5, pi, change(m, x)) for m in sample.at])
 
     for key, change in changes.items():
         if change is None:
@@ -200,20 +192,20 @@ def named(findings):
 
 # what explains more
 @pytest.mark.parametrize(("offset", "size", "rate"), [(0.1, 1.0, 50.0), (0.03, 3.0, 100.0)])
-def test_a_spring_is_named_beside_a_zero_that_is_off(model, offset, size, rate):
+def test_a_spring_is_named_beside_a_zero_that_is_off(ur5, offset, size, rate):
     how = {"effect": "spring", "size": size, "rate": rate}
-    alone, (spring,), others = both(model, model, 3, 2, offset, **how)
+    alone, (spring,), others = both(ur5, ur5, 3, 2, offset, **how)
     assert (spring.joint, spring.term.name) == ("elbow_joint", "spring")
     assert spring.size == pytest.approx(alone[0].size, rel=0.01)
     assert named(others) == [("position_offset", "elbow_joint")]
     assert others[0].evidence["size"] == pytest.approx(-offset, rel=0.04)
 
 
-def test_a_base_that_is_not_level_makes_no_counterbalance(model):
+def test_a_base_that_is_not_level_makes_no_counterbalance(ur5):
     turn = pin.exp3(np.array([np.radians(6), 0.0, 0.0]))
     gravity = turn @ np.array([0.0, 0.0, -9.81])
     truth = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), gravity=gravity)
-    alone, misfits, others = both(truth, model, 3, 1, 0.1)
+    alone, misfits, others = both(truth, ur5, 3, 1, 0.1)
     assert [(m.joint, m.term.code) for m in alone] == [("shoulder_pan_joint", "position_periodic")]
     assert misfits == ()
     assert [each.code for each in others] == ["gravity", "position_offset"]
@@ -223,9 +215,9 @@ def test_a_base_that_is_not_level_makes_no_counterbalance(model):
     assert -0.2 < others[1].evidence["size"] < -0.08  # of the second to first order only
 
 
-def test_a_joint_that_lies_elsewhere_is_named(model, tmp_path):
+def test_a_joint_that_lies_elsewhere_is_named(ur5, tmp_path):
     longer = rewritten(tmp_path / "longer.urdf", "elbow_joint", "xyz", [0.0, 0.0, 0.05])
-    first = found(model, lambda log: log, robot=longer)[0]
+    first = found(ur5, lambda log: log, robot=longer)[0]
     assert (first.code, first.where) == ("joint_origin", "elbow_joint")
     assert first.evidence["size"] == pytest.approx(0.05, rel=0.25)
 
@@ -247,16 +239,16 @@ def rewritten(path, joint, key, change, element="origin"):
         ("shoulder_lift_joint", "xyz", "axis", [np.sin(0.14), np.cos(0.14) - 1, 0]),
     ],
 )
-def test_a_joint_axis_of_another_direction_is_named(model, tmp_path, joint, key, element, change):
+def test_a_joint_axis_of_another_direction_is_named(ur5, tmp_path, joint, key, element, change):
     tilted = rewritten(tmp_path / "tilted.urdf", joint, key, change, element)
-    first = found(model, lambda log: log, robot=tilted)[0]
+    first = found(ur5, lambda log: log, robot=tilted)[0]
     assert (first.code, first.where) == ("axis_direction", joint)
     assert first.evidence["angle"] == pytest.approx(8.0, rel=0.2)
     assert "its axis is tilted by" in first.message
 
 
-def test_the_delay_of_one_torque_is_named(model):
-    (first,) = found(model, lambda log: delayed(log, 0.02, "elbow"))
+def test_the_delay_of_one_torque_is_named(ur5):
+    (first,) = found(ur5, lambda log: delayed(log, 0.02, "elbow"))
     assert (first.code, first.where) == ("joint_delay", "elbow_joint")
     assert first.evidence["size"] == pytest.approx(0.02, rel=0.25)
 
@@ -270,8 +262,8 @@ def test_a_delay_that_was_selected_as_a_drive_term_is_named(four, delay):
     assert sizes == pytest.approx([delay] * bool(delay), rel=0.25)
 
 
-def test_a_base_that_is_off_the_level_by_two_degrees_is_named(model):
-    first = found(model, lambda log: log, turn=pin.exp3(np.radians([2.0, 0.0, 0.0])))[0]
+def test_a_base_that_is_off_the_level_by_two_degrees_is_named(ur5):
+    first = found(ur5, lambda log: log, turn=pin.exp3(np.radians([2.0, 0.0, 0.0])))[0]
     assert (first.code, first.where) == ("gravity", "all joints")
     assert first.evidence["angle"] == pytest.approx(2.0, abs=0.5)
 
@@ -290,9 +282,9 @@ def disturbed(model, log, force, gravity=lambda t: 0.0 * t):
     return replace(log, tau=tau)
 
 
-def test_a_constant_force_on_the_flange_is_named_with_its_size(model):
+def test_a_constant_force_on_the_flange_is_named_with_its_size(ur5):
     force = np.array([12.0, -9.0, 0.0])
-    (first,) = found(model, lambda log: disturbed(model, log, lambda t: force))
+    (first,) = found(ur5, lambda log: disturbed(ur5, log, lambda t: force))
     assert (first.code, first.where, first.severity) == ("external_force", "all joints", "warning")
     assert first.evidence["size"] == pytest.approx(15.0, rel=0.15)
     assert "changes in time" not in first.message
@@ -305,9 +297,9 @@ def test_a_constant_force_on_the_flange_is_named_with_its_size(model):
         ("moving_gravity", lambda t: np.zeros(3), lambda t: 0.4 * np.sin(0.3 * t)),
     ],
 )
-def test_a_force_or_gravity_that_changes_in_time_is_the_only_finding(model, force, gravity, code):
+def test_a_force_or_gravity_that_changes_in_time_is_the_only_finding(ur5, force, gravity, code):
     (first,) = found(
-        model, lambda log: disturbed(model, log, force, gravity), estimator=SETTINGS
+        ur5, lambda log: disturbed(ur5, log, force, gravity), estimator=SETTINGS
     )  # unlike least squares with masses that act as gravity is tilted only
     assert (first.code, first.where, first.severity) == (code, "all joints", "error")
     assert first.evidence["share_pct"] > 50
@@ -331,8 +323,8 @@ def grasped(log, model):
     return replace(log, tau=log.tau + load * (log.t > 9.5)[:, None])
 
 
-def test_a_load_that_is_grasped_during_the_recording_is_named_with_mass_and_time(model):
-    (first,) = found(model, partial(grasped, model=model), estimator=SETTINGS)
+def test_a_load_that_is_grasped_during_the_recording_is_named_with_mass_and_time(ur5):
+    (first,) = found(ur5, partial(grasped, model=ur5), estimator=SETTINGS)
     assert (first.code, first.severity) == ("payload_step", "warning")
     assert first.evidence["mass"] == pytest.approx(1.2, rel=0.1)
     assert first.evidence["start"] == pytest.approx(9.5, abs=0.6)
@@ -341,7 +333,7 @@ def test_a_load_that_is_grasped_during_the_recording_is_named_with_mass_and_time
 
 @pytest.mark.parametrize(("faster", "noise"), [(1.1, 0.1), (1.03, 0.03)])
 def test_a_small_share_of_the_residual_is_named_if_recordings_kept_apart_show_it(
-    model, faster, noise
+    ur5, faster, noise
 ):
     """If its size is twice the one that changes a result, 0.04."""
 
@@ -350,7 +342,7 @@ def test_a_small_share_of_the_residual_is_named_if_recordings_kept_apart_show_it
         more = noise * log.tau.std(axis=0) * rng.standard_normal(log.tau.shape)
         return replace(log, tau=log.tau + more, t=faster * log.t, v=None)
 
-    findings = found(model, change, duration=25.0)
+    findings = found(ur5, change, duration=25.0)
     assert [(x.code, x.where) for x in findings[:1]] == [("time_scale", "all joints")] * (
         faster > 1.05
     )

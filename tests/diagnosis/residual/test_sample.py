@@ -10,7 +10,7 @@ import scipy.stats
 from robotid.diagnosis.decisions import Round, Rule, p_value, select
 from robotid.diagnosis.residual.term_trials import Normal, Sample, Trials
 
-N, JOINTS, BASE, FITTED, STRETCHES = 90, 2, 3, 7, 9
+N, JOINTS, BASE, FITTED = 90, 2, 3, 7
 
 
 @pytest.fixture

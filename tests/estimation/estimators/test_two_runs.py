@@ -9,7 +9,7 @@ import pytest
 from robotid.dynamics.factors import Factors, triangle_of
 from robotid.estimation.estimators.two_runs import TwoRuns, payload_runs
 
-BETA, CHANGE = np.array([2.0, -1.0, 0.5]), 0.3  # of the third parameter, in the loaded run
+BETA = np.array([2.0, -1.0, 0.5])
 NOISE = np.array([0.2, 0.05])
 NAMES = ("a", "b", "c")
 
