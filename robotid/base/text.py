@@ -132,6 +132,8 @@ def yaml_name(text: str) -> str:
 def yaml_plain(entry: Any) -> str:  # noqa: ANN401
     """Return a plain value for YAML; characters that end a line of YAML are escaped."""
     text = json.dumps(entry, ensure_ascii=False)
-    codes = ((c, ord(c)) for c in text)
-    escaped = ((c, f"\\u{x:04x}" if x < 2**16 else f"\\U{x:08x}") for c, x in codes)
-    return "".join(c if c.isprintable() else other for c, other in escaped)
+    return "".join(c if c.isprintable() else _escaped(ord(c)) for c in text)
+
+
+def _escaped(code: int) -> str:
+    return f"\\u{code:04x}" if code < 2**16 else f"\\U{code:08x}"

@@ -94,7 +94,7 @@ def _examine_log(model: RobotModel, log: Log, signals: SignalSettings) -> _Exami
     if not model.is_static:  # rows of static poses may have gaps between them
         clock = list(channels.check_clock(log))
         if without := [x for x in clock if (x.code, x.severity) == ("bunched_stamps", "error")]:
-            return _Examined(log, without)  # no times of rows: nothing else can be said
+            return _Examined(log, [*findings, *without])  # no times of rows: nothing can be said
         findings += [*clock, *channels.check_channels(log, signals)]
     findings += channels.check_limits(log, model.limits)
     prismatic = [limit.name for limit in model.limits if limit.type == "prismatic"]

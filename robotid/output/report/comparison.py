@@ -112,15 +112,13 @@ def _shortest(names: tuple[str, ...], every: set[tuple[str, ...]]) -> str:
 def _require_same_mapping(
     first: str, one: Mapping[str, Any], second: str, other: Mapping[str, Any]
 ) -> None:
-    ours, theirs = (
-        {
-            entry["name"]: entry["expression"]
-            for drives in [{entry["name"] for entry in result["drive_parameters"]}]
-            for entry in result["base_parameters"]  # without friction terms that were selected
-            if entry["name"] not in drives or entry["name"].rpartition(".")[2] in TERMS
-        }
-        for result in (one, other)
-    )
+    expressions = []
+    for result in (one, other):  # without friction terms that were selected
+        drives = {entry["name"] for entry in result["drive_parameters"]}
+        chosen = {name for name in drives if name.rpartition(".")[2] not in TERMS}
+        base = {entry["name"]: entry["expression"] for entry in result["base_parameters"]}
+        expressions.append({name: x for name, x in base.items() if name not in chosen})
+    ours, theirs = expressions
     what = "compare results of one URDF, with the same joints and drive terms"
     for has, lacks, names in (
         (first, second, [name for name in ours if name not in theirs]),
