@@ -380,6 +380,9 @@ def test_a_scale_far_from_that_of_a_complete_urdf_is_not_good(factor, mass, stat
 def test_a_torque_in_another_unit_is_poor(factor, effect):
     found = warnings_of([finding("current_for_torque", "run.csv: a, b", factor=factor)], JOINTS)
     assert [(one.joint, one.effect) for one in found] == [("a", effect), ("b", effect)]
+    every = warnings_of([finding("current_for_torque", "run.csv", factor=factor)], JOINTS)
+    named = JOINTS if effect == "poor" else ("",)
+    assert [(one.joint, one.effect) for one in every] == [(joint, effect) for joint in named]
 
 
 def test_the_scale_of_positions_comes_from_a_torque_only():
