@@ -17,6 +17,7 @@ from itertools import compress
 import numpy as np
 
 from robotid.base.findings import Finding, listed
+from robotid.base.tolerances import TINY
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.diagnosis import decisions
@@ -109,10 +110,7 @@ def _of_recordings(
     return (
         Reading("position_offset", 0.01, one, lambda on: moved(0 * on, on), offset),
         Reading("lost_motion", 0.005, one, lambda on: 0.5 * moved(0 * on, direction * on)),
-        Reading(
-            "lost_motion:load", 0.005, both_sides,
-            lambda on: 0.5 * moved(0 * on, side * on),
-        ),
+        Reading("lost_motion:load", 0.005, both_sides, lambda on: 0.5 * moved(0 * on, side * on)),
         Reading(
             "joint_elasticity", 0.0, one,
             lambda on: -sum(D @ x[..., None] for D, x in zip(of_bodies, load * on, strict=True)),
@@ -223,22 +221,20 @@ class _Alteration:
 
     def values(self, x: Array, unit: str) -> dict[str, float | str]:
         """Return the values of the finding for sizes (c,)."""
-        joint, is_one = "".join(self.joints[:1]), len(self.joints) == 1
-        sense = "one" if is_one else "more" if x[0] > 0 else "less"
-        position = f"q_{joint}" if joint else "every position"
+        position = f"q_{self.joints[0]}" if self.joints else "every position"
+        number = "one" if len(self.joints) == 1 else "more"
         residual: dict[str, float | str] = {"what": "residual", "cure": "residual"}
         factor: dict[str, float | str] = {"factor": 1 + x[0]}
         values: dict[str, dict[str, float | str]] = {
             "position_offset": {"correction": -x[0]},
             "angle_scale": factor | residual | {"named": position},
-            "torque_scale": factor | {"what": sense, "cure": sense},
+            "torque_scale": factor | {"what": number, "cure": number},
             "time_scale": factor | residual | {"speed": np.sqrt(max(1 + x[0], 0.0))},
             "external_force": {"what": "constant", "cure": "constant"},
         }
-        named = ", ".join(self.joints) or "all joints"
-        more: dict[str, float | str] = {"named": named, "unit": unit}
-        more, applied = more | values.get(self.reading.code, {}), self.reading.applied
-        if applied is not None:
+        more: dict[str, float | str] = {"named": ", ".join(self.joints) or "all joints"}
+        more |= {"unit": unit} | values.get(self.reading.code, {})
+        if (applied := self.reading.applied) is not None:
             more |= residual
             if self.reading.code == "gravity":
                 g = applied(self.on, x)[0].pin_model.gravity.linear
@@ -363,7 +359,7 @@ def _changing(
     error = float(np.sqrt(np.max(squares[driven] / sample.torque[driven], initial=0.0)))
     count = min(_SPLINES, sample.rows // (_BLOCKS * decisions.SHORTEST))
     rows = count * _BLOCKS * decisions.SHORTEST
-    if n <= 3 or error < decisions.AGREES or count < decisions.SCATTERED:
+    if n <= 3 or error < decisions.LEAST_TERM or count < decisions.SCATTERED:
         return
     from scipy.interpolate import BSpline  # takes long to import
 
@@ -427,6 +423,7 @@ def _accepted(
 ) -> Iterator[tuple[_Alteration, Finding, Sample]]:
     """Yield the alterations that explain the residual, findings, and the corrected samples."""
     trials, offered = Trials.of(sample, possible)
+    trials = replace(trials, ridge=TINY)  # masses explain nearly all of a gain of last joints
     sizes = trials.whole.parameters_each(offered)
     offered = {x: k for x, k in offered.items() if not x.reading.is_positive or sizes[x][0] > 0.0}
     rule = replace(decisions.ALTERATION, alike=decisions.AGREES) if log else decisions.ALTERATION
@@ -446,6 +443,9 @@ def _accepted(
         if best.reading.applied is not None and len(accepted.columns) == len(size):
             applied = partial(best.reading.applied, best.on)
             size, error, corrected = _refined(applied, size, sample.standard, sample)
+        if best.reading.code == "torque_scale" and not log:
+            gain = 1.0 / (1.0 - size)  # the bodies fit tau, which is gain times (1 - size) tau
+            size, error = gain - 1.0, gain**2 * error
         others = [(one.reading.code, one.joints) for one in accepted.others if one.joints]
         unit = "m" if model.layout.prismatic.intersection(best.joints) else "rad"
         norm, norm_error = float(np.linalg.norm(size)), float(np.linalg.norm(error))
