@@ -254,8 +254,7 @@ class WorstSecond:
 def worst_second(residuals: Iterable[Residual]) -> WorstSecond | None:
     """Return the window of 1 s with the largest RMS residual of a joint in its recordings.
 
-    Windows with less than half of their samples used are ignored, as those across gaps. A
-    recording shorter than 1 s is one window.
+    Windows of which less than half is used are ignored. A shorter recording is one window.
     """
     windows = [worst for residual in residuals if (worst := _worst(residual)) is not None]
     return max(windows, key=lambda worst: worst.rms, default=None)
