@@ -12,6 +12,7 @@ is none. A reading is an entry of ``readings``; ``Trials.accepted`` compares the
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import compress
 
 import numpy as np
 
@@ -257,12 +258,13 @@ def explain_residual(
         altered = np.concatenate([possible[alteration] for alteration, *_ in altered_by], axis=2)
         explained = altered_by[0][2].with_columns(altered)
     unlike = unlike_log(sample) if is_one_robot else None
-    if unlike is not None:
-        every = explained.with_columns(_columns(misfits, sample)) if misfits else explained
-        if unlike_log(every) is not None:  # no term or reading of all logs explains it
-            sample, between = _between(model, sample, unlike)
-            misfits, others = explain_residual(fit, sample, is_one_robot=False)
-            return misfits, (*between, *others)
+    every = explained.with_columns(_columns(misfits, sample)) if misfits else explained
+    if unlike and unlike_log(every):  # no term or reading of all logs explains it
+        sample, between = _between(model, sample, unlike[0])
+        misfits, others = explain_residual(fit, sample, is_one_robot=False)
+        return misfits, (*between, *others)
+    unlike = unlike_log(every, friction=True) if is_one_robot else None
+    friction = () if unlike is None else (_friction(sample, *unlike),)
     changing = tuple(_changing(model, sample, [x for x in table if x.changes], possible))
     if changing:  # it imitates all other readings and terms
         return (), changing
@@ -275,7 +277,15 @@ def explain_residual(
             among = {alteration for alteration, *_ in altered_by}
             retested = _accepted(model, sample.with_columns(lacking), possible)
             altered_by = [one for one in retested if one[0] in among]
-    return misfits, tuple(one for _, one, _ in altered_by)
+    return misfits, (*(one for _, one, _ in altered_by), *friction)
+
+
+def _friction(sample: Sample, others: OtherLogs, shares: Array) -> Finding:
+    """Return the finding of a log with other friction, by the share of each joint's torque."""
+    name = next(compress(sample.recordings, others.is_out)).log.name
+    joints = list(compress(sample.joints, shares > decisions.MISFIT_MATTERS))
+    figures = {"named": listed(joints), "change_pct": 100 * shares.max()}
+    return finding("log_differs:friction", name, joints, also=False, **figures)
 
 
 def _between(model: RobotModel, sample: Sample, others: OtherLogs) -> tuple[Sample, list[Finding]]:
