@@ -71,8 +71,7 @@ def _inertial_spread(model: RobotModel) -> Array:
 
 
 def _drive_spread(model: RobotModel, rms: Array) -> Array:
-    first = model.n_rows - len(model.joints)
-    rms = rms[:, first:]
+    rms = rms[:, -len(model.joints) :]
     largest = rms.max(axis=1, keepdims=True)
     tau, v, a = np.maximum(rms, np.where(largest > 0.0, 1e-3 * largest, 1.0))  # never 0
     carried = carried_inertia(model)
