@@ -188,8 +188,8 @@ def check_excitation(
     thinned = [motion.every(step) for motion in motions]
     try:
         masks = [sure_rows(model.layout, m.v, signals.min_velocity) for m in thinned]
-        rows = zip(thinned, masks, strict=True)
-        factors = merge([compress(base_problem(model, mapping, *motion)) for motion in rows])
+        used = zip(thinned, masks, strict=True)
+        factors = merge([compress(base_problem(model, mapping, *motion)) for motion in used])
         wls = WLS(prior=mapping.to_base(prior)).fit(factors)
     except RobotIdError as error:
         yield finding(
