@@ -70,6 +70,7 @@ _LEAST = 0.01  # plausible change between logs, at least, over the prior standar
 #: With these no result is good.
 _CAUTIONS = (
     "at_bound", "coarse_steps", "end_stop", "gains_contradicted", "not_followed", "other_gains",
+    "position_offset",
 )  # fmt: skip
 _MOVING = 0.05  # smallest speed above the noise, relative to the largest speed of a joint
 _MISMATCH = 0.5  # largest relative error of a torque that the loop of its joint gives
@@ -409,6 +410,7 @@ def _of_fit(result: PositionIdentification, *, is_explained: bool) -> Iterator[F
     yield from _limits_found(result)
     yield from _unequal_gains(result)
     yield from _encoder_findings(result)
+    yield from _other_zeros(result)
     for tried in result.fit.tried:
         figures: Any = {"terms": " and ".join(tried.terms), "gain_pct": 100 * tried.gain}
         if tried.dropped and not is_explained:
@@ -429,12 +431,9 @@ def _settled_delay(examined: Finding, result: PositionIdentification) -> Finding
         return examined
     estimate, free_parameters = result.estimate, result.fit.simulator.free_parameters
     errors = estimate.std_error[[free.what == "delay" for free in free_parameters]].tolist()
-    if any(name.endswith("delay") for name in estimate.details["at_bound"]):
-        known = "its standard error belongs to the bound, not to the delay"
-        remedy = f"{examined.remedy}. The delay of the fit is 0, its lower bound: {known}"
-        return examined.reworded(remedy=remedy)
+    is_at_bound = any(name.endswith("delay") for name in estimate.details["at_bound"])
     error = max(errors, default=0.0)
-    if error > _KNOWN * examined.evidence["longest"]:
+    if is_at_bound or error > _KNOWN * examined.evidence["longest"]:
         return examined
     what, figures = "fitted" if errors else "stated", {**examined.evidence, "std_error": error}
     return finding("slow_command:known", examined.log, examined.joints, what=what, **figures)
@@ -448,12 +447,11 @@ def _at_bound(result: PositionIdentification, *, is_explained: bool) -> Iterator
     largest = {free.name: free.highest for free, value in values if value >= free.highest}
     if largest:
         yield _named("at_bound:largest", [f"{name} = {x:g}" for name, x in largest.items()])
-    least = {
-        free.name: free.lowest
-        for free in free_parameters
-        if free.what in _POSITIVE and free.name in at_bound
-    }
-    if at_zero := [name for name in at_bound if name not in {**largest, **least}]:
+    least, early = (
+        {x.name: x.lowest for x in free_parameters if x.what in kinds and x.name in at_bound}
+        for kinds in (_POSITIVE, ["delay"])
+    )
+    if at_zero := [name for name in at_bound if name not in {**largest, **least, **early}]:
         stated = [name for name in ("kp", "kd", "delay") if getattr(loop, name) is not None]
         gains = [name for name in stated if name != "delay"]
         is_wrong = bool(stated) and not is_explained
@@ -462,8 +460,26 @@ def _at_bound(result: PositionIdentification, *, is_explained: bool) -> Iterator
         yield _named("at_bound:zero", at_zero, wrong=is_wrong, **words, **todo)
     if least:
         yield _named("at_bound:least", [f"{name} = {x:.3g}" for name, x in least.items()])
-    if any(name.endswith("delay") for name in at_zero):
-        yield finding("no_delay", subject="delay")
+    for x, value, error in zip(free_parameters, estimate.theta, estimate.std_error, strict=True):
+        if x.what == "delay" and ((is_least := x.name in early) or value < -QUANTILE * error):
+            figures: Any = {"delay": value, "bound": is_least, "cure": is_least}
+            severity = "warning" if is_least else "note"
+            yield finding("no_delay", severity=severity, subject=x.name, **figures)
+
+
+def _other_zeros(result: PositionIdentification) -> Iterator[Finding]:
+    """Yield joints whose constant torque is larger than all others: position and command differ."""
+    estimate, loops = result.estimate, result.fit.loops
+    errors = [run.log.q_ref - run.log.q for run in result.fitted if run.log.q_ref is not None]
+    free_parameters = result.fit.simulator.free_parameters
+    for x, value, error in zip(free_parameters, estimate.theta, estimate.std_error, strict=True):
+        if result.has_gains and x.term == TERMS["offset"]:
+            [j], kp = x.joints, loops.kp[x.joints[0]]
+            others = kp * np.vstack(errors)[:, j] - value  # [N m or N]
+            if abs(value) > np.sqrt(np.mean(others**2)):
+                figures = {"offset": -value / kp, "std_error": error / kp}
+                joint, unit = result.model.joints[j], units_of(result.model, replace(x, term=None))
+                yield finding("position_offset:commands", "", joint, unit=unit, **figures)
 
 
 def _unequal_gains(result: PositionIdentification) -> Iterator[Finding]:

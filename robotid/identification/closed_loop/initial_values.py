@@ -298,11 +298,12 @@ def free_drive_parameters(
     base: Loops,
     typical: TypicalSizes,
     *,
+    earliest: float,
     finds_kd: Array,
     finds_limit: Array,
 ) -> list[FreeParameter]:
     """Return the free parameters of drives and loops, with initial values from ``base``."""
-    # finds_kd (n,), finds_limit (n,)
+    # earliest delay [s], finds_kd (n,), finds_limit (n,)
     members: dict[str, list[int]] = {}
     for j, group in enumerate(groups):
         members.setdefault(group, []).append(j)
@@ -325,7 +326,8 @@ def free_drive_parameters(
             if sharers:
                 initial = float(np.median(getattr(base, what)[sharers]))
                 wide = WEAK_PRIOR * float(np.median(spread[sharers]))
-                lowest = _LEAST * initial if what in ("kp", "limit") else 0.0
+                smallest = _LEAST * initial
+                lowest = {"kp": smallest, "limit": smallest, "delay": earliest}.get(what, 0.0)
                 found.append(
                     FreeParameter(f"{name}.{what}", what, tuple(sharers), initial, wide, lowest)
                 )

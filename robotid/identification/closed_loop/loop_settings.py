@@ -47,7 +47,10 @@ class LoopSettings(Settings):
         within=GAIN["within"],
         among=("find",),
     )
-    delay: PerJoint | None = setting(None, "delay of the command [s]; default: fitted", **DELAY)
+    delay: PerJoint | None = setting(
+        None, "delay of the command, held from row to row [s]; default: fitted, at least minus one "
+        "row: below 0 the controller continues the command between rows", **DELAY,
+    )  # fmt: skip
     delays: str = setting(
         "one", "the fitted delays: 'one' for the robot (bus and controller), or one per 'group'",
         among=("one", "group"),

@@ -93,6 +93,25 @@ def test_drives_behind_a_slow_clock_are_recovered_once_it_is_stated(rng):
     assert worst[None][0] > 0.2
 
 
+def test_a_command_that_goes_on_between_its_rows_is_early(rng):
+    """Of commands held for 2 ms every fifth is logged: 10 ms held would be 4 ms later."""
+    robot = plant("planar", rng, delay=0.0)
+    log, truth = recorded(robot, rng, duration=2.0, noise=1e-4)
+    q, q_ref = log.q[::5], log.q_ref[::5]
+    log = Log(log.t[::5], q, 0 * q, robot.model.joints, q_ref=q_ref, has_torque=False)
+    found = identify_loops(
+        robot.model, [log], [], stated(robot, delays="one"), COARSE, chooses=False
+    )
+    [early] = [f for f in found.findings if f.code == "no_delay"]
+    assert (early.severity, early.where) == ("note", "robot.delay")
+    assert early.evidence["delay"] == pytest.approx(-4.25e-3, abs=2e-4), "and half a step"
+    assert "-4" in early.message
+    assert "by interpolation or at a higher rate" in early.message
+    estimate = found.estimate
+    for name, value, error in zip(estimate.names, estimate.theta, estimate.std_error, strict=True):
+        assert name == "robot.delay" or abs(value - truth[name]) < 4.0 * error, name
+
+
 def test_the_drives_of_an_arm_are_recovered_with_steps_that_are_halved():
     """From commands that last as long as the steps to begin with, which are too long by far."""
     rng = np.random.default_rng(1)
@@ -240,8 +259,8 @@ def test_a_delay_at_its_bound_leaves_the_warning_of_a_slow_command(found):
     bound = replace(found, fit=fitted)
     named = {one.code: one for one in loop_findings(bound, [SLOW])}
     assert named["slow_command"].severity == "warning"
-    assert "or steps. The delay of the fit is 0" in named["slow_command"].message
-    assert "the data do not determine it" in named["no_delay"].message
+    assert named["no_delay"].severity == "warning"
+    assert "its lower bound, one row" in named["no_delay"].message
     entries = build_result(bound, {"estimator": {"name": "simulation"}})["drive_parameters"]
     sources = {e["source"] for e in entries if e["name"].endswith(".delay")}
     assert "bound" in sources
