@@ -42,9 +42,7 @@ class Contact(Settings):
         "have contact_<link>, or contacts are found",
     )
     radius: float = setting(
-        0.0,
-        "radius of a round foot, which rolls on level ground [m]",
-        within=_LENGTH,
+        0.0, "radius of a round foot, which rolls on level ground [m]", within=_LENGTH
     )
     uncertainty: float | None = setting(
         None,

@@ -72,6 +72,7 @@ _CAUTIONS = (
     "at_bound", "coarse_steps", "end_stop", "gains_contradicted", "not_followed", "other_gains",
     "position_offset",
 )  # fmt: skip
+_SEVERITY = ("note", "warning")  # of what is expected, and what is not
 _MOVING = 0.05  # smallest speed above the noise, relative to the largest speed of a joint
 _MISMATCH = 0.5  # largest relative error of a torque that the loop of its joint gives
 _KNOWN = 0.1  # standard error of a known delay, relative to the range found from one response
@@ -362,7 +363,7 @@ def loop_findings(
     # Bodies connect the joints: a cause that the logs show explains what the fit finds of others.
     settled, found = [_settled_delay(one, result) for one in examined], list[Finding]()
     causes = [one for one in settled if one.code in codes_with("names_cause")]
-    causes += _limits_found(result)
+    causes += (one for one in _of_drives(result) if one.code != "no_delay")
     if result.has_gains and all(one.severity == "note" for one in causes):
         with suppress(NotConvergedError, DataError):  # a log that cannot be simulated, or is short
             found.extend(_other_gains(result))
@@ -407,10 +408,9 @@ def _of_fit(result: PositionIdentification, *, is_explained: bool) -> Iterator[F
     at_rest = [x.name for x in friction if not moves[list(x.joints)].any()]
     if left := [name for name in at_rest if name not in names]:
         yield _named("undetermined:rest", left)
-    yield from _limits_found(result)
+    yield from _of_drives(result)
     yield from _unequal_gains(result)
     yield from _encoder_findings(result)
-    yield from _other_zeros(result)
     for tried in result.fit.tried:
         figures: Any = {"terms": " and ".join(tried.terms), "gain_pct": 100 * tried.gain}
         if tried.dropped and not is_explained:
@@ -441,45 +441,22 @@ def _settled_delay(examined: Finding, result: PositionIdentification) -> Finding
 
 def _at_bound(result: PositionIdentification, *, is_explained: bool) -> Iterator[Finding]:
     """Yield which parameters are estimated at a bound, and what to do about it."""
-    loop, estimate = result.loop, result.estimate
-    free_parameters, at_bound = result.fit.simulator.free_parameters, estimate.details["at_bound"]
+    estimate, free_parameters = result.estimate, result.fit.simulator.free_parameters
     values = zip(free_parameters, estimate.theta.tolist(), strict=True)
     largest = {free.name: free.highest for free, value in values if value >= free.highest}
     if largest:
         yield _named("at_bound:largest", [f"{name} = {x:g}" for name, x in largest.items()])
-    least, early = (
-        {x.name: x.lowest for x in free_parameters if x.what in kinds and x.name in at_bound}
-        for kinds in (_POSITIVE, ["delay"])
-    )
-    if at_zero := [name for name in at_bound if name not in {**largest, **least, **early}]:
-        stated = [name for name in ("kp", "kd", "delay") if getattr(loop, name) is not None]
+    others = [x for x in free_parameters if x.name in {*estimate.details["at_bound"]} - {*largest}]
+    least = [f"{x.name} = {x.lowest:.3g}" for x in others if x.what in _POSITIVE]
+    if at_zero := [x.name for x in others if x.what not in (*_POSITIVE, "delay")]:
+        stated = [x for x in ("kp", "kd", "delay") if getattr(result.loop, x) is not None]
         gains = [name for name in stated if name != "delay"]
         is_wrong = bool(stated) and not is_explained
         words = {"stated": " or ".join(stated), "own": " and ".join(gains)}
         todo = {"gains": is_wrong and bool(gains), "late": "delay" in stated}
         yield _named("at_bound:zero", at_zero, wrong=is_wrong, **words, **todo)
     if least:
-        yield _named("at_bound:least", [f"{name} = {x:.3g}" for name, x in least.items()])
-    for x, value, error in zip(free_parameters, estimate.theta, estimate.std_error, strict=True):
-        if x.what == "delay" and ((is_least := x.name in early) or value < -QUANTILE * error):
-            figures: Any = {"delay": value, "bound": is_least, "cure": is_least}
-            severity = "warning" if is_least else "note"
-            yield finding("no_delay", severity=severity, subject=x.name, **figures)
-
-
-def _other_zeros(result: PositionIdentification) -> Iterator[Finding]:
-    """Yield joints whose constant torque is larger than all others: position and command differ."""
-    estimate, loops = result.estimate, result.fit.loops
-    errors = [run.log.q_ref - run.log.q for run in result.fitted if run.log.q_ref is not None]
-    free_parameters = result.fit.simulator.free_parameters
-    for x, value, error in zip(free_parameters, estimate.theta, estimate.std_error, strict=True):
-        if result.has_gains and x.term == TERMS["offset"]:
-            [j], kp = x.joints, loops.kp[x.joints[0]]
-            others = kp * np.vstack(errors)[:, j] - value  # [N m or N]
-            if abs(value) > np.sqrt(np.mean(others**2)):
-                figures = {"offset": -value / kp, "std_error": error / kp}
-                joint, unit = result.model.joints[j], units_of(result.model, replace(x, term=None))
-                yield finding("position_offset:commands", "", joint, unit=unit, **figures)
+        yield _named("at_bound:least", least)
 
 
 def _unequal_gains(result: PositionIdentification) -> Iterator[Finding]:
@@ -547,15 +524,26 @@ def _relative_errors(run: PositionEvaluation) -> Array:
     return 100.0 * np.divide(run.rmse, run.spread, where=run.moves, out=np.zeros(len(run.rmse)))
 
 
-def _limits_found(result: PositionIdentification) -> Iterator[Finding]:
-    """Yield the estimated torque limits of the drives, except those at a bound."""
-    estimate, free_parameters = result.estimate, result.fit.simulator.free_parameters
-    severity = "note" if result.loop.limit == "find" else "warning"
-    for free, value, error in zip(free_parameters, estimate.theta, estimate.std_error, strict=True):
-        if free.what == "limit" and free.name not in estimate.details["at_bound"]:
-            joint, figures = result.model.joints[free.joints[0]], {"std_error": error}
-            figures |= {"limit": value, "unit": units_of(result.model, free)}
-            yield finding("limit", "", joint, severity=severity, **figures)
+def _of_drives(result: PositionIdentification) -> Iterator[Finding]:
+    """Yield what the estimated limits, delays and offsets of the drives say."""
+    model, estimate, simulator = result.model, result.estimate, result.fit.simulator
+    away = [run.log.q_ref - run.log.q for run in result.fitted if run.log.q_ref is not None]
+    values = zip(estimate.theta.tolist(), estimate.std_error.tolist(), strict=True)
+    for x, (value, error) in zip(simulator.free_parameters, values, strict=True):
+        joint, is_bound = model.joints[x.joints[0]], x.name in estimate.details["at_bound"]
+        figures: Any = {"std_error": error, "unit": units_of(model, x)}
+        if x.what == "limit" and not is_bound:
+            figures |= {"limit": value, "severity": _SEVERITY[result.loop.limit != "find"]}
+            yield finding("limit", "", joint, **figures)
+        elif x.what == "delay" and (is_bound or value < -QUANTILE * error):
+            figures = {"delay": value, "bound": is_bound, "cure": is_bound}
+            yield finding("no_delay", subject=x.name, severity=_SEVERITY[is_bound], **figures)
+        elif x.term == TERMS["offset"] and result.has_gains:
+            kp = float(result.fit.loops.kp[x.joints[0]])
+            if abs(value) > np.sqrt(np.mean((kp * np.vstack(away)[:, x.joints] - value) ** 2)):
+                figures |= {"torque": value, "offset": value / kp}
+                length = "m" if joint in model.layout.prismatic else "rad"
+                yield finding("position_offset:commands", "", joint, length=length, **figures)
 
 
 def _encoder_findings(result: PositionIdentification) -> Iterator[Finding]:

@@ -47,10 +47,7 @@ class LoopSettings(Settings):
         within=GAIN["within"],
         among=("find",),
     )
-    delay: PerJoint | None = setting(
-        None, "delay of the command, held from row to row [s]; default: fitted, at least minus one "
-        "row: below 0 the controller continues the command between rows", **DELAY,
-    )  # fmt: skip
+    delay: PerJoint | None = setting(None, "delay of the command [s]; default: fitted", **DELAY)
     delays: str = setting(
         "one", "the fitted delays: 'one' for the robot (bus and controller), or one per 'group'",
         among=("one", "group"),

@@ -134,7 +134,7 @@ def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
         source = entry.get("source", "stated" if error is None else "data")
         source = "bound" if entry.get("at_bound") else str(source)
         ends = _range(
-            _simulated(entry), math.inf if error is None else error, source, reach,
+            entry["value"], math.inf if error is None else error, source, reach,
             _least(term), is_positive=term == "kp",
         ) | {"unit": entry["unit"]}  # fmt: skip
         ends = ranges["drives"].get(drive, {}).get(term, ends)
@@ -189,7 +189,7 @@ def _range(
     is_positive: bool = False,
 ) -> dict[str, Any]:
     """Return the range of a value; without ends if its standard error is infinite."""
-    nominal, half = float(value), quantile * float(error)
+    nominal, half = max(float(value), least), quantile * float(error)  # a delay may be below 0
     if not math.isfinite(half):
         return {"nominal": nominal, "source": source}
     low = nominal * math.exp(-half / nominal) if is_positive else max(nominal - half, least)
@@ -319,13 +319,8 @@ def _quantile(content: Mapping[str, Any]) -> float:
 
 
 def _nominal(result: Result, names: list[str]) -> list[float]:
-    stated = {entry["name"]: _simulated(entry) for entry in result.content["drive_parameters"]}
-    return [stated[name] for name in names]
-
-
-def _simulated(entry: Mapping[str, Any]) -> float:
-    """Return the value that a simulator is given, which has no negative delay."""
-    return max(entry["value"], 0.0) if entry["name"].endswith(".delay") else float(entry["value"])
+    stated = {entry["name"]: float(entry["value"]) for entry in result.content["drive_parameters"]}
+    return [max(stated[x], 0.0) if x.endswith(".delay") else stated[x] for x in names]
 
 
 def _bodies(model: RobotModel, values: Array) -> dict[str, Any]:

@@ -107,10 +107,7 @@ def page_of(found: Identification, report: Report, origin: Origin, files: Mappin
     worst = escape(next(iter(worst_errors(report.counted)), ""))
     sections = {
         "errors": Section(
-            "Errors",
-            f"{definition}{shown}{after}",
-            f"{len(verdicts)} joints, by recording",
-            False,
+            "Errors", f"{definition}{shown}{after}", f"{len(verdicts)} joints, by recording", False
         ),
         "findings": Section("Findings", findings, tally(causes, worst) or "none", False),
         "friction": Section("Friction against speed", report.friction, "of each joint", False),
