@@ -49,10 +49,9 @@ class Cause:
     findings: tuple[Finding, ...]  # by descending severity
 
 
-def not_ignored(findings: Iterable[Finding], ignore: Iterable[str]) -> tuple[Finding, ...]:
+def not_ignored(findings: Iterable[Finding], ignore: Collection[str]) -> tuple[Finding, ...]:
     """Return the findings whose codes are not ignored."""
-    ignored = set(ignore)
-    return tuple(finding for finding in findings if finding.code not in ignored)
+    return tuple(finding for finding in findings if finding.code not in ignore)
 
 
 def listed(names: Iterable[object], limit: int | None = None) -> str:
@@ -76,8 +75,7 @@ def quoted(name: str) -> str:
 
 def toml_key(name: str) -> str:
     """Return a name as a key of a job file, in quotes if required."""
-    is_bare = re.fullmatch(r"[A-Za-z0-9_-]+", name) is not None
-    return name if is_bare else quoted(name)
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else quoted(name)
 
 
 def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:

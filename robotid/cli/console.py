@@ -176,8 +176,7 @@ def print_error(error: BaseException, words: str = "") -> None:
 def shown_log(*, is_verbose: bool) -> Iterator[None]:
     """Show warnings of the logger "robotid" on the standard error stream.
 
-    A message is printed once, its figures make no difference: otherwise each piece of a long log
-    repeats the message with its own number of samples.
+    A message that differs in figures only is printed once: pieces of a long log repeat it.
     """
     logger, handler, printed = logging.getLogger("robotid"), logging.StreamHandler(), set[str]()
 

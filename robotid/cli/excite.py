@@ -198,8 +198,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("--report", metavar="PAGE.html", help=words)
     MOTION.add(parser)
     add_shown(parser, "json", "progress")
-    flags = parser.add_argument_group("the robot, instead of a job file")
-    JOB.add(flags, ROBOT[:3])
+    JOB.add(parser.add_argument_group("the robot, instead of a job file"), ROBOT[:3])
 
 
 def run(options: argparse.Namespace) -> None:

@@ -307,8 +307,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("results", nargs="*", metavar="RESULT", help=results)
     add("--html", metavar="FILE", help="page to write; default: replay.html beside the RESULT")
     add("--ghost", metavar="LOG", help="second motion, shown as a ghost")
-    group = parser.add_argument_group("the log, unless a RESULT is given")
-    JOB.add(group, ONLINE)
+    JOB.add(parser.add_argument_group("the log, unless a RESULT is given"), ONLINE)
 
 
 def run(options: argparse.Namespace) -> None:

@@ -137,8 +137,8 @@ def _alone(log: Log, kind: str, j: int, others: Array) -> str:
     *first, last = [f"{each}_{log.joints[j]}" for each in kinds]
     columns = f"{', '.join(first)} and {last}" if first else last
     return (
-        f"The other revolute joints reach at most {others.max():.3g}: this joint alone may be in "
-        f"degrees. Then multiply {columns} by {np.pi / 180:.7f} (pi / 180) in the recording, "
+        f"The other revolute joints reach at most {others.max():.3g}: {log.joints[j]} alone may be "
+        f"in degrees. Then multiply {columns} by {np.pi / 180:.7f} (pi / 180) in the recording, "
         "because the unit applies to all joints"
     )
 

@@ -93,10 +93,9 @@ class _Hull:
 class Clearance:
     """The distances of a robot's links to each other, to the floor and to obstacles.
 
-    Links joined by a joint are not checked. Nor are two links whose hulls touch at zero position
-    and in 95 % of random poses: they are in contact by design. Two links whose distance is smaller
-    than the clearance in 95 % of the poses, but which do not always touch, are close by design:
-    half their median distance is required.
+    Links joined by a joint are not checked, nor two links whose hulls touch at zero position and in
+    95 % of random poses. Of two links that are nearer than the clearance in 95 % of the poses, but
+    do not always touch, half their median distance is required.
     """
 
     pairs: Array  # (pairs, 2), numbers of the two hulls of each pair

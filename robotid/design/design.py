@@ -398,8 +398,7 @@ class Designer:
         if self.clearance is None:
             return None
         within = multipliers.distance_without_cost(self._required)
-        placed = self.clearance.placed(rows.motion[0])
-        return self.clearance.near(placed, within)
+        return self.clearance.near(self.clearance.placed(rows.motion[0]), within)
 
     def _objective(self, C: Array) -> float:
         """Return the criterion of a motion."""

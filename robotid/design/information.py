@@ -87,8 +87,7 @@ class MotionRows:
 class MotionInformation:
     """The rows W of the base problem along a motion, W beta = tau, and their gradient.
 
-    Drive terms depend on the current motion only: internal states are at their steady value. The
-    sign of friction is tanh(w / 0.01 rad/s), so that it has a gradient.
+    Internal states of drives are steady, and the sign of friction is tanh(w / 0.01 rad/s).
     """
 
     model: RobotModel  # the robot, with a fixed base

@@ -305,8 +305,13 @@ _DEPENDENT = 1e-3  # relative singular value below which columns are dependent
 
 
 def row_mask(model: RobotModel, trajectory: Trajectory, min_velocity: float) -> Array:
-    """Return the used rows, (N, n_rows), bool: those where the sign of friction is certain."""
-    return sure_rows(model.layout, trajectory.v, min_velocity)
+    """Return the used rows, (N, n_rows): the sign of friction is certain, the torque not dead."""
+    used, tau = sure_rows(model.layout, trajectory.v, min_velocity), trajectory.tau
+    if tau.any():
+        driven = np.isin(model.row_names, sorted({*model.joints} - {*model.passive}))
+        is_dead = np.ptp(tau, axis=0) <= NOISE_FREE * np.abs(tau).max(axis=0)
+        used[:, driven & is_dead] = False
+    return used
 
 
 def static_rows(model: RobotModel, log: Log, signals: SignalSettings) -> tuple[Trajectory, Array]:

@@ -214,9 +214,8 @@ def _world_acceleration(motion: Trajectory, bias: Array) -> Array:
 def mean_drift(a: Array, segment: Array) -> float:
     """Return the mean of an acceleration, root mean square of its three components [m/s^2].
 
-    The mean has the weight w(t) = sin^2(pi t / T) in each segment of duration T. By parts it is
-    that of w'' x: constant speeds have no effect, and those at the ends have none. The plain mean
-    is their change over T, 0.05 m/s^2 for a robot that sways.
+    The mean has the weight w(t) = sin^2(pi t / T) in each segment of duration T: the speeds at its
+    ends have no effect. The plain mean is their change over T, 0.05 m/s^2 for a robot that sways.
     """
     counts = np.unique(segment, return_counts=True)[1]
     w = np.concatenate([np.hanning(count + 2)[1:-1] for count in counts])

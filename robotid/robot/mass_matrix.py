@@ -83,9 +83,7 @@ def rigid_mass_matrices(
     for M_k, configuration in zip(M, configurations, strict=True):
         M_k[:] = pin.crba(model.pin_model, data, configuration)
     G = model.velocity_map
-    if np.array_equal(G, np.eye(len(G))):
-        return M
-    return np.asarray(G.T @ M @ G)
+    return M if np.array_equal(G, np.eye(len(G))) else np.asarray(G.T @ M @ G)
 
 
 def drive_inertia(layout: ParameterLayout, pi: Array) -> Array:

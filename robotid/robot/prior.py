@@ -71,8 +71,7 @@ def _inertial_spread(model: RobotModel) -> Array:
 
 
 def _drive_spread(model: RobotModel, rms: Array) -> Array:
-    first = model.n_rows - len(model.joints)
-    rms = rms[:, first:]
+    rms = rms[:, -len(model.joints) :]
     largest = rms.max(axis=1, keepdims=True)
     tau, v, a = np.maximum(rms, np.where(largest > 0.0, 1e-3 * largest, 1.0))  # never 0
     carried = carried_inertia(model)
@@ -190,10 +189,12 @@ def _placeholders(model: RobotModel) -> set[str]:
             by_body.setdefault(place.body, []).append(place.link)
     moving = {link for links in by_body.values() for link in links}
     shared = Counter(value for link, value in values.items() if link in moving)
+    # two links are enough where every centre of mass is on a joint, as without an <origin>
+    least = _COPIES if any(np.any(model.tree.inertials[x].com) for x in moving) else 2
     return {
         model.layout.bodies[k]
         for k, links in by_body.items()
-        if all(link in values and shared[values[link]] >= _COPIES for link in links)
+        if all(link in values and shared[values[link]] >= least for link in links)
     }
 
 

@@ -445,7 +445,8 @@ def parse_urdf(path: str | Path) -> ET.Element:
         ) from error
     if robot.tag != "robot":
         raise ModelError(
-            f"{path.name}: the top element is <{robot.tag[:LONGEST_PATH]}>, expected <robot>"
+            f"{path.name}: the top element is <{robot.tag[:LONGEST_PATH]}>, expected <robot>; "
+            "convert it to URDF"
         )
     _check_bounds(robot, path.name)
     return robot

@@ -129,7 +129,7 @@ def test_the_urdf_with_drives_is_rnea_and_drive_terms(identified, monkeypatch):
 
 
 def test_a_track_gives_parameters_over_time_and_marks_the_load(panda, tmp_path, capsys):
-    log = payload_log(panda, np.random.default_rng(0), duration=12.0, at=10.0)
+    log = payload_log(panda, np.random.default_rng(0), duration=12.0, at=10.0, rate=100.0)
     write_log(log, tmp_path / "log.csv")
     urdf = of_boxes(panda.tree.path, tmp_path / "panda.urdf")
     joints = ",".join(panda.joints)

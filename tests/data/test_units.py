@@ -145,7 +145,7 @@ def three(scale, **scales):
 def test_one_joint_in_degrees_is_converted_alone():
     """pi / 180 is 0.0174533; the others reach 0.8 (a), 0.3 (b), 1.5 (c)."""
     one, c = np.array([1.0, 1.0, 1.0]), np.array([1.0, 1.0, 180 / np.pi])
-    advice = "at most 0.8: this joint alone may be in degrees. Then multiply {} by 0.0174533"
+    advice = "at most 0.8: c alone may be in degrees. Then multiply {} by 0.0174533"
     for changes, columns in (
         ({"scale": c}, "q_c"),
         ({"scale": c, "v": c}, "q_c and dq_c"),
@@ -159,7 +159,7 @@ def test_one_joint_in_degrees_is_converted_alone():
         assert "in the recording, because the unit applies to all joints" in str(caught.value)
         assert '. If all joints are in degrees, set units angle = "deg"' in str(caught.value)
     a = 180 / np.pi * np.array([1.0, 0.0, 0.0]) + [0.0, 1.0, 1.0]
-    with pytest.raises(DataError, match=r"most 1\.51: this joint alone .* multiply qref_a by"):
+    with pytest.raises(DataError, match=r"most 1\.51: a alone .* multiply qref_a by"):
         check_units(three(one, q_ref=a), LogUnits())
     # all in degrees, a joint farther than a revolution, and too few joints to compare
     for log, prismatic in (

@@ -192,6 +192,8 @@ CASES = {
         lambda x, t: set_rows([700, 701], x[[701, 700]])(x, t))),
     "gap of 1 s": Case(("gap",), rows(
         lambda x: np.delete(x, slice(len(x) * 9 // 20, len(x) // 2)))),
+    "torque of the URDF's model": Case(("model_torque",), lambda table: table | {
+        x: table[x] - left for x, left in compensated(table, 1.0).items() if x[:3] == "tau"}),
     "torque delayed by 30 ms": Case(("torque_delay",), late("tau_", 0.03)),
     "velocity delayed by 30 ms": Case(("velocity_delay",), late("dq_", 0.03)),
     "torque clipped": Case(("clipped",), column("tau_elbow_joint",

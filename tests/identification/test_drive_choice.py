@@ -234,17 +234,15 @@ def test_what_is_nearly_chosen_widens_the_intervals_it_would_move(model):
 
 
 # --- wrong bodies of a URDF -----------------------------------------------------------------------
-RATE, SECONDS, NOISE = 100.0, 24.0, 0.01  # [Hz], [s], of the standard deviation of each torque
+RATE, SECONDS, NOISE = 50.0, 24.0, 0.01  # [Hz], [s], of the standard deviation of each torque
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_bodies_of_1_g_in_the_urdf_do_not_become_springs(tmp_path, seed):
+def test_bodies_of_1_g_in_the_urdf_do_not_become_springs(tmp_path, rng):
     source = example_urdf("ur10_robot.urdf")
     light = '<inertia ixx="1e-6" iyy="1e-6" izz="1e-6" ixy="0" ixz="0" iyz="0"'
     text = re.sub(r'<mass value="[^"]*"', '<mass value="1e-3"', source.read_text())
     (tmp_path / "light.urdf").write_text(re.sub(r"<inertia [^>/]*", light, text))
     plant = pin.buildModelFromUrdf(str(source))
-    rng = np.random.default_rng(seed)
     t = np.arange(round(RATE * SECONDS)) / RATE
     w = 2 * np.pi / SECONDS * np.arange(1, 9)
     a, b = rng.uniform(-0.35, 0.35, (2, len(w), plant.nv))

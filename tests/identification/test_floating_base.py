@@ -28,7 +28,7 @@ FEET = ("FL_foot", "FR_foot", "RL_foot", "RR_foot")
 POSTURE = {"hip": (0.0, 0.12), "thigh": (0.8, 0.25), "calf": (-1.6, 0.3)}  # middle, reach [rad]
 ARMATURE, DAMPING, TORQUE = 0.01, 0.2, 0.05
 IMU = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.2, 1.0), np.array([0.15, -0.05, 0.1]))
-SIGNALS = robotid.SignalSettings(rate=250.0, cutoff=25.0, velocity="differentiated")
+SIGNALS = robotid.SignalSettings(rate=125.0, cutoff=25.0, velocity="differentiated")
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +112,7 @@ def test_unseen_motion_is_predicted_judged_and_drawn_by_the_joints(found, monkey
     ratio = result.standard[masses].sum() / before[masses].sum()
     assert [check.scale, check.factor] == pytest.approx([ratio, ratio])
     assert check.is_total_determined
-    (one,), some = result.validation, np.arange(0, 400, 7)
+    (one,), some = result.validation, np.arange(0, 200, 4)
     W = trajectory_regressor(result.model, one.recording.trajectory, some)
     np.testing.assert_allclose(
         (W @ result.standard).reshape(-1, 18), one.torques["estimate"][some], atol=1e-9

@@ -39,6 +39,14 @@ def test_torques_that_are_all_0_are_refused(ur5, rng):
     with pytest.raises(DataError, match="the torque of every joint is 0 in all fitted logs"):
         identify(ur5, [off, off], signals=EXACT)
     identify(ur5, [off, log], signals=EXACT)
+    tau = log.tau + rng.normal(0.0, 0.005, (300, 6)) * np.std(log.tau, axis=0)
+    for dead in (0.0, 3.0):  # a channel that is dead changes no other joint
+        part = replace(log, tau=np.column_stack([tau[:, :5], np.full(300, dead)]))
+        found = robotid.identify(ur5, part, signals=EXACT, friction="viscous+coulomb")
+        assert found.verdict.joints["wrist_3_joint"].status == "not evaluated"
+        assert "wrist_3_joint: no recording has motion and a torque" in str(found.verdict.reasons)
+        error = np.std(found.predict(log.q, log.v, log.a) - log.tau, axis=0)
+        assert np.all(error[:5] < 0.01 * np.std(log.tau, axis=0)[:5])
 
 
 def test_a_recording_that_was_fitted_does_not_show_what_repeats(planar, rng):

@@ -207,7 +207,7 @@ FAULTS = {
     "no mass": ('<mass value="2"/>', "", "needs both <mass> and <inertia>"),
     "no XML": ("</robot>", "", "is not well-formed XML"),
     "unknown encoding": ("<robot", '<?xml version="1.0" encoding="klingon"?><robot', "well-formed"),
-    "not a robot": ("robot", "sdf", "the top element is <sdf>, expected <robot>"),
+    "not a robot": ("robot", "sdf", "<sdf>, expected <robot>; convert it to URDF"),
 }
 
 

@@ -636,8 +636,8 @@ class Finder:
         at_rest = [joint for joint in self.joints if joint in joints]
         if len(at_rest) == len(self.joints):
             return f"Record the {NOUNS[kind.removesuffix('m')]} of each joint"
-        if leaders := {x.name: x.mimic[0] for x in self.robot if x.mimic and x.name in at_rest}:
-            moved = ", ".join(f"{joint} mimics {leader}" for joint, leader in leaders.items())
+        leaders = {x.name: x.mimic[0] for x in self.robot if x.mimic and x.name in at_rest}
+        if moved := ", ".join(f"{x} mimics {y}" for x, y in leaders.items() if y not in at_rest):
             return (
                 f"{moved}: a joint that moves with its leader needs no column; set mimic = "
                 '"coupled" in the job file'

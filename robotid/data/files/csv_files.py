@@ -27,10 +27,7 @@ _SENSED = ("base_", "imu_", "contact_", "wrench_")  # columns that other devices
 def _open(path: Path, source: LogSource) -> Table:
     names, separator, header, first = _header(path, source)
     rows = _CsvRows(path, names, separator, header)
-
-    def read(wanted: Sequence[str]) -> dict[str, Array]:
-        return rows.read(wanted, 0, sys.maxsize, Place())
-
+    read = partial(rows.read, first=0, stop=sys.maxsize, near=Place())
     return Table(names, read, rows=rows).with_names(named_by_row(first))
 
 
@@ -115,7 +112,7 @@ class _CsvRows(RowReader):
                         f"{self.path.name}: line {number} has {cells} cells, the header has "
                         f"{count}; correct it"
                     )
-            yield line
+            yield line if separator == "," else line.replace(",", ".")  # of decimals
 
     def _bad_cell(self, columns: list[int]) -> DataError:
         """Return the error on the first cell that is not a number."""

@@ -144,7 +144,8 @@ def _examine_torques(model: RobotModel, logs: Sequence[_Examined], signals: Sign
         is_read |= bool(torques)
         torques = torques or list(check.loads(name))
         coarse = {joint for x in one.findings if x.code == "quantised" for joint in x.joints}
-        off = [] if model.constraints else _drives_off(check.probe, coarse, name)
+        is_wrong = any(x.severity == "error" for x in one.findings)  # and so the URDF's torque
+        off = [] if model.constraints or is_wrong else _drives_off(check.probe, coarse, name)
         one.findings += [*off, *torques]
         if not (model.constraints or any(x.severity == "error" for x in torques)):
             one.findings += check_torque_delay(model, one.log, signals, name)

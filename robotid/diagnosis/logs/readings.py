@@ -231,6 +231,13 @@ class Samples:
         return np.asarray(self.motion.products[..., c, c].sum(axis=0))
 
     @property
+    def is_possible(self) -> bool:
+        """Whether no torque is in a scale that only bodies almost without mass explain."""
+        rows, gain = self.motion.rows, self.gain[self.motion.rows]
+        size = np.sum(self.motion.tau**2, axis=0)[self.order[rows]] / gain**2
+        return not ((gain != 1.0) & (TENFOLD**2 * size < self.urdf_size)).any()
+
+    @property
     def unexplained(self) -> Array:
         """The same share of torques with their signs, at most 1, (m,)."""
         m, own = self.motion, self.order[self.motion.rows]
@@ -511,8 +518,8 @@ def _best(samples: Samples) -> Best | None:
     every = enumerate(readings(fewer, bool(few.share.max() > _GROSS)))
     gains = [(misfit(fewer.share) - misfit(r.of(fewer).share), i, r) for i, r in every]
     tried = sorted((x for x in gains if x[0] > _ALIKE), key=lambda x: -x[0])[:_TRIED]
-    refined = [(reading.refined(few, 8), i) for _, i, reading in tried]
-    left = {r: (misfit(r.of(samples).share), len(r.joints), i) for r, i in refined}
+    refined = [(r, r.of(samples), i) for _, i, x in tried for r in [x.refined(few, 8)]]
+    left = {r: (misfit(x.share), len(r.joints), i) for r, x, i in refined if x.is_possible}
     if not left:
         return None
     starts = {(r.code, r.joints): r for r in sorted(left, key=lambda r: left[r], reverse=True)}
@@ -521,6 +528,6 @@ def _best(samples: Samples) -> Best | None:
     best = alike[0].refined(few, 20)
     read = best.of(samples)
     gain = misfit(samples.held_out) - misfit(read.held_out)
-    if min(gain, misfit(samples.share) - misfit(read.share)) < CERTAIN:
+    if min(gain, misfit(samples.share) - misfit(read.share)) < CERTAIN or not read.is_possible:
         return None
     return Best(best, tuple(alike[1:]), read, gain, samples.unexplained, read.unexplained)

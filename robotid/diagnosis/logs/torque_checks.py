@@ -222,6 +222,11 @@ def load_model(probe: Probe, share: Array) -> LoadModel:
 
 def _check_loads(probe: Probe, share: Array, name: str, is_explained: bool) -> Iterator[Finding]:
     """Yield torques in another scale, a payload, a URDF of another robot."""
+    left = np.mean((probe.tau - probe.loads.sum(axis=2)) ** 2, axis=0)
+    noise = share * probe.tau.var(axis=0) / decisions.BETTER
+    if ((left < noise) & (share < EXPLAINED)).all():  # no drive has friction or an armature
+        yield finding("model_torque", name)
+        return
     # A common scale must fit with about the URDF's masses; else the URDF is of another robot.
     model = load_model(probe, share)
     _, theta, error = model.fit()

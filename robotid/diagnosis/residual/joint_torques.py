@@ -7,7 +7,7 @@ segments are held out in turn, and the means of the bins in the other segments p
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -71,7 +71,6 @@ class JointTorque:
     #: Share of the squared residual above a frequency [Hz] where the torque has half of it at most.
     beyond: float = 0.0
     frequency: float = np.inf
-    fitted: JointTorque | None = None  # of the fitted recordings; None if it is of them itself
 
     @cached_property
     def residual(self) -> Array:
@@ -166,24 +165,14 @@ class JointTorque:
             frequency=self.frequency,
             names=", ".join(d.name for d in self.follows if d.name != "constant"),
         )  # fmt: skip
-        before = () if self.fitted is None else self.fitted.follows
-        # the residual of the fitted recordings does not depend on this quantity
-        has_changed = any(
-            d.name == name and d.share is not None and not d.is_significant for d in before
-        )
-        what = "changed" if name and has_changed else name or kind
-        return cause, sentence_of("residual:advice", what=what, frequency=self.frequency)
+        return cause, sentence_of("residual:advice", what=name or kind, frequency=self.frequency)
 
 
 def joint_torques(fit: Fit) -> tuple[JointTorque, ...]:
     """Return the torque of each row, its parts, and what its residual depends on."""
     # At most 2000 samples, of the validation recordings, or of the fitted ones if there are none.
     validation = [e for e in fit.validation if not e.is_refitted]
-    fitted = _torques_of(fit, fit.fitted)
-    if not validation:
-        return fitted
-    judged = zip(_torques_of(fit, validation), fitted, strict=True)
-    return tuple(replace(torque, fitted=of_fit) for torque, of_fit in judged)
+    return _torques_of(fit, validation or fit.fitted)
 
 
 def _torques_of(fit: Fit, evaluations: Sequence[Evaluation]) -> tuple[JointTorque, ...]:

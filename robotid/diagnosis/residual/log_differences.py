@@ -13,12 +13,12 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from robotid.base.typing import Array
-from robotid.diagnosis.decisions import BETTER, EXACT, NOTHING
+from robotid.diagnosis.decisions import BETTER, EXACT, MISFIT_MATTERS, NOTHING
 from robotid.diagnosis.residual.term_trials import Normal, Sample, cut_segments
 
 
-def unlike_log(sample: Sample) -> "OtherLogs | None":
-    """Return the fit to all logs but the one that contradicts them, the later of two."""
+def unlike_log(sample: Sample, *, friction: bool = False) -> "tuple[OtherLogs, Array] | None":
+    """Return the fit to all logs but the one that contradicts them, the later of two, and how."""
     paths = [x.log.path or str(k) for k, x in enumerate(sample.recordings)]  # "": in memory
     logs, log_of = list(dict.fromkeys(paths)), np.repeat(paths, [len(k) for k in sample.taken])
     if len(logs) < 2:
@@ -29,9 +29,10 @@ def unlike_log(sample: Sample) -> "OtherLogs | None":
         OtherLogs.of([path == log for path in paths], total - x.all, rows - x.rows, sample.share)
         for log, x in zip(logs, each, strict=True)
     ]
-    excess = np.array([fit.excess(own) for fit, own in zip(others, each, strict=True)])
-    k = 1 if len(logs) == 2 else int(np.argmax(np.log(excess + NOTHING).sum(axis=1)))
-    return others[k] if excess[k].max() * BETTER**2 > 1.0 else None
+    of, least = (OtherLogs.friction, MISFIT_MATTERS) if friction else (OtherLogs.excess, BETTER**-2)
+    sizes = np.array([of(fit, own) for fit, own in zip(others, each, strict=True)])
+    k = 1 if len(logs) == 2 else int(np.argmax(np.log(sizes + NOTHING).sum(axis=1)))
+    return (others[k], sizes[k]) if sizes[k].max() > least else None
 
 
 def _friction(sample: Sample, rows: Array) -> Array:
@@ -53,6 +54,7 @@ class _Products:
     all: Array  # (n, b + 1, b + 1)
     free: Array  # (n, b + 1, b + 1), of rows orthogonal to friction and offset
     rows: Array  # (n,), number of rows
+    torque: Array  # (n,), their squared torque
 
     @classmethod
     def of(cls, sample: Sample, rows: Array) -> "_Products":
@@ -61,7 +63,9 @@ class _Products:
         weight = sample.weight[rows].T
         Q = np.linalg.qr(weight[..., None] * _friction(sample, rows))[0]  # (n, N, 3)
         P, S = X.swapaxes(1, 2) @ X, Q.swapaxes(1, 2) @ X
-        return cls(P, P - S.swapaxes(1, 2) @ S, np.count_nonzero(weight, axis=1))
+        torque = weight * np.concatenate([motion.tau for motion in sample.at])[rows].T
+        count = np.count_nonzero(weight, axis=1)
+        return cls(P, P - S.swapaxes(1, 2) @ S, count, np.sum(torque**2, axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +98,12 @@ class OtherLogs:
         x = np.linalg.solve(P[:-1, :-1] + A, P[:-1, -1] + A @ self.change)
         squares = self.scale**2 * _squares(own.free, x)
         return np.asarray(squares / np.maximum(own.rows * self.share, 1.0))
+
+    def friction(self, own: _Products) -> Array:
+        """Return the change of a log's friction over its torque, RMS, (n,); 0 if not clear."""
+        before, left = (_squares(products, self.change) for products in (own.all, own.free))
+        share = np.sqrt((before - left) / np.maximum(own.torque, NOTHING))
+        return np.where(left < BETTER**2 * before, share, 0.0)
 
     def left_out(self, sample: Sample) -> tuple[Sample, Array]:
         """Return samples of the log left out, with this fit as the prior, and which they are."""

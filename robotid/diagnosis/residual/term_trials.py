@@ -307,9 +307,12 @@ def _noise_level(r: Array, used: Array, own: int, basis: Array | None) -> tuple[
     # Rows that were projected together have one noise level, and an outlier excludes its sample.
     u = np.ones(r.shape) if basis is None else _lengths(basis)
     size = np.abs(r) / u
-    columns = zip(size[:own].T, used[:own].T, strict=True)
-    typical = np.array([np.median(x[at]) if at.any() else np.inf for x, at in columns])
-    usual: Array = size <= decisions.OUTLIER * typical
+    typical = np.zeros((2, r.shape[1]))  # of fitted and of validation logs, whose error is no jump
+    for k, rows in enumerate((slice(own), slice(own, None))):
+        columns = zip(size[rows].T, used[rows].T, strict=True)
+        typical[k] = [np.median(x[at]) if at.any() else np.inf for x, at in columns]
+    largest = np.repeat([typical[0], typical.max(axis=0)], [own, len(r) - own], axis=0)
+    usual: Array = size <= decisions.OUTLIER * largest
     if basis is not None:
         usual = np.all(usual | ~used, axis=1, keepdims=True)
     used = used & usual

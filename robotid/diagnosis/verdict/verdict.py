@@ -113,19 +113,15 @@ class Predictions:
         names = [joint for joint in self.on_each() if joint not in validated]
         still = [joint for joint in names if joint not in fitted]
         missing = [joint for joint in names if joint in fitted]
-        named = {"recording": still, "validation log": missing if self.validation else []}
-        return [
-            sentence_of("verdict:rest", joints=listed(names), logs=logs)
-            for logs, names in named.items()
-            if names
-        ]
+        rest = {"recording": still, "validation log": missing if self.validation else []}
+        return [sentence_of("verdict:rest", joints=listed(x), logs=k) for k, x in rest.items() if x]
 
     def why_untested(self, joint: str) -> str:
         """Return why a joint was evaluated on no validation log."""
         if joint in self.fitted and not self.validation:
             return "all logs contain fitted samples" if self.refitted else "no validation log given"
         logs = "validation log" if joint in self.fitted else "recording"
-        return f"it does not move in any {logs}"
+        return f"no {logs} has motion and a torque that varies"
 
 
 @dataclass(frozen=True)

@@ -352,11 +352,9 @@ class Fit(Identified, Solution):
     def _bands(self) -> tuple[TorqueBand, ...]:
         """The torque band of each recording from its residuals, fitted recordings first.
 
-        The noise part is chosen so that the bands contain 95 % of the torques of all recordings of
-        the same kind, fitted or validation. For validation recordings it is the prediction error on
-        new motion, and the band covers further motions as it covers these (split conformal
-        prediction, Lei et al. 2018, doi:10.1080/01621459.2017.1307116, with the parameters' part as
-        the lower bound).
+        They contain 95 % of the torques of all recordings of a kind, and those of validation cover
+        further motions likewise (split conformal prediction, Lei et al. 2018,
+        doi:10.1080/01621459.2017.1307116, with the parameters' part as the lower bound).
         """
         evaluations = (*self.fitted, *self.validation)
         is_fitted = [k < len(self.fitted) or e.is_refitted for k, e in enumerate(evaluations)]

@@ -102,10 +102,8 @@ def find_outliers(
 ) -> tuple[Outlier, ...]:
     """Return the rows with very large residuals, the largest first: standard (p,).
 
-    Near a reversal an error of the step of Coulomb friction is accepted: during stiction it can
-    have any value between its bounds, and a joint that stops reverses in the filtered motion. It is
-    near if the filtered velocity has it within 1 / cutoff [s], or would have it at the sample's
-    acceleration.
+    Near a reversal, within 1 / cutoff [s] of the filtered motion, an error of the step of Coulomb
+    friction is accepted: during stiction it can have any value between its bounds.
     """
     outliers: list[Outlier] = []
     step = _friction_step(model, standard)

@@ -270,14 +270,11 @@ def _unlike(
 
 
 def _explained(compared: Compared, k: int, noise: float, *, is_drive: bool) -> float:
-    """Return what a difference of a group explains of a run or unit: chi^2 less 2 each (Akaike).
-
-    Errors are those of a common noise. Only drive terms vary between alike runs.
-    """
+    """Return what a difference of a group explains of a run or unit: chi^2 less 2 each (Akaike)."""
     mean, std = compared.mixture.at(k).moments
     C = compared.covariance[k]
     V = noise * C
-    if is_drive:
+    if is_drive:  # other parameters do not vary between alike runs
         V = V + np.diag(np.maximum(std**2 - np.diag(C), 0.0))
     away = compared.values[k] - mean
     return float(away @ np.linalg.solve(V, away)) - 2.0 * len(away)

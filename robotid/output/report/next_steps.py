@@ -204,8 +204,7 @@ def _of_verdict(found: TorqueIdentification) -> list[Cause]:
     beaten = {joint for joint, m in measured if is_beaten(m)} - settled
     poor = {j for j, m in measured if m.relative_error_pct and m.relative_error_pct > GOOD}
     for code, joints in (("beaten", beaten), ("poor_prediction", poor)):
-        if joints:
-            named = tuple(joint for joint in found.model.joints if joint in joints)
+        if named := tuple(joint for joint in found.model.joints if joint in joints):
             causes.append(Cause(code, "warning", named, (), ()))
     if not predictions:
         causes.append(Cause("not_validated", "warning", (), (), ()))

@@ -254,8 +254,7 @@ class WorstSecond:
 def worst_second(residuals: Iterable[Residual]) -> WorstSecond | None:
     """Return the window of 1 s with the largest RMS residual of a joint in its recordings.
 
-    Windows with less than half of their samples used are ignored, as those across gaps. A
-    recording shorter than 1 s is one window.
+    Windows of which less than half is used are ignored. A shorter recording is one window.
     """
     windows = [worst for residual in residuals if (worst := _worst(residual)) is not None]
     return max(windows, key=lambda worst: worst.rms, default=None)
@@ -530,7 +529,8 @@ def why_section(found: TorqueIdentification) -> str:
         found.joint_torques, key=lambda x: -x.rms["residual"] / (x.rms["measured"] or np.inf)
     )
     logs = torques[0].rows.recordings
-    kind = "Validation logs" if torques[0].fitted is not None else "Fitted logs, without validation"
+    is_validation = any(not e.is_refitted for e in found.validation)
+    kind = "Validation logs" if is_validation else "Fitted logs, without validation"
     names = [e.name for e in found.validation or found.fitted]
     link = f"recording {names.index(logs[0])}" if logs[0] in names else "fitted"  # as the torques
     joints = "".join(

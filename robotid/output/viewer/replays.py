@@ -294,10 +294,9 @@ _ATTEMPTS = ((True, 3.0), (False, 3.0), (False, 7.0))
 def thin(solids: Sequence[Sequence[Surface]], most: int) -> list[list[Surface]]:
     """Return surfaces with at most so many triangles in total; closed ones stay closed.
 
-    fast-simplification collapses edges in the order of the change of shape; a collapsed edge opens
-    no hole. The triangles of a surface have one orientation, outwards if it is closed. Each side of
-    a sharp edge has its own corners. Garland, Heckbert (1997), Surface simplification using quadric
-    error metrics.
+    fast-simplification collapses edges in the order of the change of shape, which opens no hole.
+    Triangles point outwards; each side of a sharp edge has its own corners. Garland, Heckbert
+    (1997), Surface simplification using quadric error metrics.
     """
     share = most / max(sum(len(patch.faces) for solid in solids for patch in solid), 1)
     return [_thinned_solid(solid, share) if solid else [] for solid in solids]

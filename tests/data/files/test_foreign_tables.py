@@ -41,14 +41,15 @@ def juggled(*topics, words=WORDS, scale=1.0):
     return {"__time": LOG.t} | dict(sorted(columns.items()))
 
 
-@pytest.fixture(params=["csv", "parquet", "frame"])
+@pytest.fixture(params=["csv", "txt", "parquet", "frame"])
 def given(request, tmp_path):
     """A function that makes a file or a DataFrame of columns."""
 
     def make(columns):
         frame = pd.DataFrame(columns)
-        if request.param == "csv":
-            frame.to_csv(tmp_path / "run.csv", index=False)
+        if signs := {"csv": ",.", "txt": ";,"}.get(request.param):  # between cells, of decimals
+            path = tmp_path / f"run.{request.param}"
+            frame.to_csv(path, index=False, sep=signs[0], decimal=signs[1])
         if request.param == "parquet":
             frame.to_parquet(tmp_path / "run.parquet")
         return frame if request.param == "frame" else tmp_path / f"run.{request.param}"
@@ -92,13 +93,10 @@ def test_efforts_may_be_currents_and_columns_may_be_mapped_by_the_names_in_the_f
     np.testing.assert_array_equal(mapped.tau[:, 1], 5 * LOG.tau[:, 1])
 
 
-def test_a_table_with_standard_columns_and_another_clock_is_left_as_it_is(given):
+def test_standard_columns_and_a_clock_count_more_than_those_of_plotjuggler(given):
     others = juggled("/a") | juggled("/b")
     del others["__time"]
     assert_same(read_log(given(table_of(LOG) | others), JOINTS), LOG)
-
-
-def test_a_time_beside_that_of_plotjuggler_is_the_time_of_the_log():
     both = pd.DataFrame(juggled("/joints") | {"time": 7.0 + LOG.t})
     back = read_log(both, JOINTS)
     np.testing.assert_array_equal(back.t, 7.0 + LOG.t)
@@ -198,6 +196,12 @@ def test_a_log_is_taken_by_the_names_of_its_joints(ur5, rng):
         "locked={'wrist_1_joint': 0.0})"
     ):
         read_logs(log.select(["elbow_joint"]), ["elbow_joint", "wrist_1_joint"])
+    names = [f"panda_joint{k}" for k in range(1, 8)]  # a finger mimics another without columns
+    log = pd.DataFrame({"time": T} | {f"{x}_{name}": T for x in ("q", "tau") for name in names})
+    with pytest.raises(
+        DataError, match="them there, as --lock panda_finger_joint1=0 --lock panda_"
+    ):
+        robotid.identify(example_urdf("panda.urdf"), log)
 
 
 NANOSECONDS = 1_700_000_000_000_000_000 + (T * 1e9).round().astype(int)

@@ -313,8 +313,8 @@ CSV_FAULTS = [
     (HEADER + ROWS + "0.2,abc,3.0\n", ": q_a is 'abc' at row 2, expected a number; remove the row"),
     (HEADER + ROWS + "0.2,1.0,\n", ": tau_a is empty at row 2, expected a number; remove the row "
      "or correct the recording, or interpolate a column of another rate at the joints' stamps"),
-    ("time;q_a;tau_a\n0,0;1,0;2,0\n", ": time is '0,0' at row 0, expected a number; write decimals "
-     "with a point; remove"),
+    ('time,q_a,tau_a\n"0,0","1,0","2,0"\n', ": time is '0,0' at row 0, expected a number; write "
+     "decimals with a point; remove"),
     ((HEADER + ROWS).encode("utf-16"), "is not UTF-8 text"),
     (HEADER.encode() + b"\xe9\n", "is not UTF-8 text"),
     ("time,q_a,wrench_fz_f\n0,1,2\n0.1,1,\n0.2,1,3\n", "wrench_fz_f is empty at row 1, expected a "

@@ -10,6 +10,7 @@ import pinocchio as pin
 import pytest
 from helpers.corruptions import CASES, NOISE, ROBOTS, clean_log, controlled_log, robot, table_of
 from helpers.legged import with_other_bodies
+from helpers.paths import ROOT
 from helpers.synthetic import exact_log, perfect, truth
 
 from robotid.base.findings import Finding, grouped
@@ -317,30 +318,31 @@ def test_motor_side_columns_are_refused_by_name(recordings, monkeypatch):
 
 # ---- command line and identify
 @pytest.fixture(scope="module")
-def wrong_sign(ur5, tmp_path_factory):
+def wrong_sign(planar, tmp_path_factory):
     path = tmp_path_factory.mktemp("doctor") / "run.csv"
-    table = table_of(clean_log(ur5, 0, duration=10.0, rate=50.0))
-    write_columns(CASES["one torque negated"].change(table), path)
+    table = table_of(clean_log(planar, 0, duration=10.0, rate=50.0))
+    table |= {"tau_joint_2": -table["tau_joint_2"]}
+    write_columns(table, path)
     return str(path)
 
 
-URDF = str(example_urdf("ur5_robot.urdf"))
+URDF, PLANAR = str(example_urdf("ur5_robot.urdf")), str(ROOT / "urdf" / "planar_2r.urdf")
 
 
 def test_doctor_prints_findings_as_json_and_as_text(wrong_sign, tmp_path, capsys):
-    assert main(["doctor", URDF, wrong_sign, "--json"]) == 1
+    assert main(["doctor", PLANAR, wrong_sign, "--json"]) == 1
     (first, *_) = json.loads(capsys.readouterr().out)["findings"]
     assert set(first) == {"code", "severity", "where", "message", "evidence"}
     assert (first["code"], first["severity"]) == ("torque_sign", "error")
-    assert main(["doctor", URDF, wrong_sign]) == 1
-    assert capsys.readouterr().out.startswith("error: torque_sign: run.csv: the torque of elbow")
+    assert main(["doctor", PLANAR, wrong_sign]) == 1
+    assert capsys.readouterr().out.startswith("error: torque_sign: run.csv: the torque of joint_2")
     job = tmp_path / "job.toml"
-    job.write_text(f'urdf = "{URDF}"\n[[identification]]\nlog = "{wrong_sign}"\n')
+    job.write_text(f'urdf = "{PLANAR}"\n[[identification]]\nlog = "{wrong_sign}"\n')
     assert main(["doctor", str(job)]) == 1
     assert "torque_sign" in capsys.readouterr().out
-    assert main(["doctor", URDF, wrong_sign, "--ignore", "torque_sign"]) == 0
-    assert main(["doctor", URDF, wrong_sign, "--ignore", "torque_sgn"]) == 2
-    assert main(["doctor", URDF, str(tmp_path / "none.csv")]) == 1
+    assert main(["doctor", PLANAR, wrong_sign, "--ignore", "torque_sign"]) == 0
+    assert main(["doctor", PLANAR, wrong_sign, "--ignore", "torque_sgn"]) == 2
+    assert main(["doctor", PLANAR, str(tmp_path / "none.csv")]) == 1
 
 
 def test_what_makes_a_result_wrong_leads_its_verdict_unless_it_is_ignored(
@@ -348,15 +350,15 @@ def test_what_makes_a_result_wrong_leads_its_verdict_unless_it_is_ignored(
 ):
     job = tmp_path / "job.toml"
     job.write_text(
-        f'urdf = "{URDF}"\n[output]\nreport = false\n[[identification]]\nlog = "{wrong_sign}"\n'
+        f'urdf = "{PLANAR}"\n[output]\nreport = false\n[[identification]]\nlog = "{wrong_sign}"\n'
     )
     words = ["identify", str(job), "--out", str(tmp_path / "out"), "--json"]
     assert main(words) == 1
     result = json.loads(capsys.readouterr().out)
     assert result["verdict"]["status"] == "poor"
-    assert "the torque of elbow_joint has the opposite sign" in result["verdict"]["reasons"][0]
+    assert "the torque of joint_2 has the opposite sign" in result["verdict"]["reasons"][0]
     assert "torque_sign" in [warning["code"] for warning in result["warnings"]]
-    words = ["identify", URDF, wrong_sign, *words[2:], "--estimator", "wls", "--no-report"]
+    words = ["identify", PLANAR, wrong_sign, *words[2:], "--estimator", "wls", "--no-report"]
     assert main([*words, "--ignore", "torque_sign"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert not any("opposite sign" in reason for reason in result["verdict"]["reasons"])

@@ -42,8 +42,7 @@ def ur5_log():
     return clean_log(robot("ur5"), 100, duration=10.0, rate=50.0)
 
 
-@pytest.mark.parametrize("file", ["ur3_robot.urdf", "ur10_robot.urdf"])
-@pytest.mark.parametrize("seed", [100, 102])
+@pytest.mark.parametrize(("file", "seed"), [("ur3_robot.urdf", 100), ("ur10_robot.urdf", 102)])
 def test_the_urdf_of_another_robot_is_no_scale_of_the_torque(file, seed):
     log = clean_log(robot("ur5"), seed, duration=8.0)
     assert loads(RobotModel.from_urdf(example_urdf(file)), log) == [("urdf_mismatch", "run.csv")]

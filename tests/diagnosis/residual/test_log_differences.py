@@ -92,11 +92,21 @@ def test_what_differs_in_one_log_is_named_with_its_size(logs, change, where, siz
         assert found.evidence["size"] == pytest.approx(size, rel=0.06)
 
 
+def test_a_log_with_other_friction_or_another_offset_is_named(logs):
+    typical = np.sqrt(np.mean(logs[1].tau ** 2, axis=0)) * np.eye(6)[2]
+    for change in (0.3 * logs[1].v / np.std(logs[1].v, axis=0), -0.3):
+        other = replace(logs[1], tau=logs[1].tau + change * typical)
+        for fitted, validation in (([logs[0], other], logs[2:]), (logs[:1], [other])):
+            (found,) = differences(fitted, validation)
+            assert "friction or offset of elbow_joint" in found.message
+            assert found.evidence["change_pct"] == pytest.approx(30, rel=0.25)
+
+
 def test_the_fit_to_the_other_logs_is_the_prior_of_a_log(logs):
     """What a log changes of it gives the fit to all logs, by matrices of all their rows."""
     gain = np.array([1, 0.8, 1, 1, 1, 1])
     sample = sample_of([logs[0], replace(logs[1], tau=gain * logs[1].tau)], logs[2:])[1]
-    others = unlike_log(sample)
+    others, _ = unlike_log(sample)
     own = others.left_out(sample)[0]
     assert list(others.is_out) == [False, True, False]
     b = len(sample.U)

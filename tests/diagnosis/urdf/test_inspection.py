@@ -280,6 +280,9 @@ def test_only_findings_that_take_assumed_masses_as_evidence_are_explained(tmp_pa
     )
     held = with_lower.standard_parameters() - alone.standard_parameters()
     np.testing.assert_allclose(held[[0, 1, 6]], [1, 0.7, 0.03 + 0.7**2])
+    same = re.sub(r"<inertial>.*?</inertial>", INERTIAL.format(m=1), CLEAN, flags=re.S)
+    (tmp_path / "same.urdf").write_text(same)  # of placeholders without <origin>, two are enough
+    assert len(with_assumed_inertials(RobotModel.from_urdf(tmp_path / "same.urdf")).assumed) == 2
 
 
 # --- inertials against the geometry ---------------------------------------------------------------

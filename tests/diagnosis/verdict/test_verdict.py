@@ -58,7 +58,7 @@ def verdict(validation, fitted=None, **open):
         ({"a": joint(4.0)}, None, "good", "on validation logs: at most 4.0 % at every joint"),
         (None, None, "usable", "not evaluated: no validation log given"),
         ({"a": joint(4.0)}, {"a": joint(3.0), "b": joint(3.0)}, "usable",
-         "the joints b do not move in any validation log: not evaluated"),
+         "b: no validation log has motion and a torque that varies: not evaluated"),
         ({"a": joint(20.0), "b": joint(40.0, constant=False)}, None, "poor",
          "b: worse than a constant torque on val.csv: error 40.0 %; a constant would give 33.3 %"),
         ({"a": joint(None, constant=False)}, None, "poor",
@@ -91,7 +91,7 @@ def test_each_joint_has_a_verdict_of_its_own():
     (a, *_), _, (c, *_), d = (one.reasons for one in found.joints.values())
     assert a.startswith("error at most 4.0 %")
     assert c.startswith("c: worse than a constant torque on val.csv: error 40.0 %")
-    assert d == ("it does not move in any validation log",)
+    assert d == ("no validation log has motion and a torque that varies",)
 
 
 def test_the_good_joint_with_the_largest_error_has_the_cause_of_its_residual():
@@ -294,8 +294,8 @@ def test_joints_better_by_the_urdf_are_those_of_all_logs():
     assert "predicts a better than the identified bodies: keep the URDF's values for" in one
     assert "predicts b better than the identified bodies. The links of these joints keep" in other
     assert found.at_rest() == [
-        "the joints e do not move in any recording: not evaluated",
-        "the joints d do not move in any validation log: not evaluated",
+        "e: no recording has motion and a torque that varies: not evaluated",
+        "d: no validation log has motion and a torque that varies: not evaluated",
     ]
     errors = {name: one.errors for name, one in found.on_each().items()}
     assert errors == {"a": [4.0, 4.0], "b": [4.0, 4.0], "c": [4.0], "d": [], "e": []}

@@ -39,7 +39,7 @@ def commands():
     return np.column_stack(table.columns)[2600:3000]
 
 
-def reference(drives, q_ref, *, step=2e-4, settles=0.3):
+def reference(drives, q_ref, *, step=5e-4, settles=0.3):
     """Return the positions of the closed loop, shape (N, n), by another way than MuJoCo's."""
     # M dv = dt (clip(kp (q_ref(t - delay) - q) - kd v) - offset - Fv v - c) - friction, implicit in
     # v; each joint's friction is the impulse within +-Fc dt that comes nearest to stopping it.
