@@ -43,6 +43,7 @@ from robotid.estimation.variation.variation import PLAUSIBLE, vary
 from robotid.identification.closed_loop.initial_values import CLEAR, parallel_axes
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.loop_simulator import (
+    POSITIVE,
     FreeParameter,
     LoopSimulator,
     with_terms,
@@ -72,11 +73,9 @@ _CAUTIONS = (
     "at_bound", "coarse_steps", "end_stop", "gains_contradicted", "not_followed", "other_gains",
     "position_offset",
 )  # fmt: skip
-_SEVERITY = ("note", "warning")  # of what is expected, and what is not
 _MOVING = 0.05  # smallest speed above the noise, relative to the largest speed of a joint
 _MISMATCH = 0.5  # largest relative error of a torque that the loop of its joint gives
 _KNOWN = 0.1  # standard error of a known delay, relative to the range found from one response
-_POSITIVE = ("kp", "limit")  # parameters whose lower bound is more than 0
 #: Figures of a log's gains relative to the fit; that of kd is 0 where the fit has none.
 _GAINS = {"kp": "ratio", "kd": "kd_ratio"}
 _UNEQUAL = 3.0  # ratio of the gains of equal drives from which on they are reported
@@ -277,8 +276,7 @@ def with_gravity(model: RobotModel, log: Log) -> Log:
 def driven_log(model: RobotModel, log: Log, signals: SignalSettings) -> Log:
     """Return a log whose feed-forward torque is the measured one, and its position the command."""
     # constant between two rows: the mean of the two, which avoids a delay of half a row
-    free = np.array([joint.turns_freely for joint in model.limits])
-    log = unwrap(log, free)
+    log = unwrap(log, np.array([joint.turns_freely for joint in model.limits]))
     measured = np.column_stack(
         [np.interp(log.t + signals.torque_delay, log.t, tau) for tau in log.tau.T]
     )
@@ -447,8 +445,8 @@ def _at_bound(result: PositionIdentification, *, is_explained: bool) -> Iterator
     if largest:
         yield _named("at_bound:largest", [f"{name} = {x:g}" for name, x in largest.items()])
     others = [x for x in free_parameters if x.name in {*estimate.details["at_bound"]} - {*largest}]
-    least = [f"{x.name} = {x.lowest:.3g}" for x in others if x.what in _POSITIVE]
-    if at_zero := [x.name for x in others if x.what not in (*_POSITIVE, "delay")]:
+    least = [f"{x.name} = {x.lowest:.3g}" for x in others if x.what in POSITIVE]
+    if at_zero := [x.name for x in others if x.what not in (*POSITIVE, "delay")]:
         stated = [x for x in ("kp", "kd", "delay") if getattr(result.loop, x) is not None]
         gains = [name for name in stated if name != "delay"]
         is_wrong = bool(stated) and not is_explained
@@ -526,18 +524,17 @@ def _relative_errors(run: PositionEvaluation) -> Array:
 
 def _of_drives(result: PositionIdentification) -> Iterator[Finding]:
     """Yield what the estimated limits, delays and offsets of the drives say."""
-    model, estimate, simulator = result.model, result.estimate, result.fit.simulator
+    model, estimate, free = result.model, result.estimate, result.fit.simulator.free_parameters
     away = [run.log.q_ref - run.log.q for run in result.fitted if run.log.q_ref is not None]
-    values = zip(estimate.theta.tolist(), estimate.std_error.tolist(), strict=True)
-    for x, (value, error) in zip(simulator.free_parameters, values, strict=True):
+    for x, value, error in zip(free, estimate.theta, estimate.std_error, strict=True):
         joint, is_bound = model.joints[x.joints[0]], x.name in estimate.details["at_bound"]
         figures: Any = {"std_error": error, "unit": units_of(model, x)}
         if x.what == "limit" and not is_bound:
-            figures |= {"limit": value, "severity": _SEVERITY[result.loop.limit != "find"]}
-            yield finding("limit", "", joint, **figures)
+            severity = "note" if result.loop.limit == "find" else "warning"
+            yield finding("limit", "", joint, severity=severity, limit=value, **figures)
         elif x.what == "delay" and (is_bound or value < -QUANTILE * error):
-            figures = {"delay": value, "bound": is_bound, "cure": is_bound}
-            yield finding("no_delay", subject=x.name, severity=_SEVERITY[is_bound], **figures)
+            code = "no_delay" if is_bound else "no_delay:early"
+            yield finding(code, subject=x.name, delay=value)
         elif x.term == TERMS["offset"] and result.has_gains:
             kp = float(result.fit.loops.kp[x.joints[0]])
             if abs(value) > np.sqrt(np.mean((kp * np.vstack(away)[:, x.joints] - value) ** 2)):

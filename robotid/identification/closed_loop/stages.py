@@ -402,8 +402,6 @@ def _initialise_from_commands(task: _Task) -> _Initial:
     differs = np.ptp([log.gain_factors[1] for log in logs], axis=0) > 0.0
     finds_kd = differs | uses_torques | all(log.v_ref is not None for log in logs)
     dt = max(float(np.median(np.diff(log.t))) for log in logs)
-    # a command that is not held over a row, as between the ticks of a slow clock, acts earlier
-    earliest = 0.0 if loop.rate is not None and loop.rate * dt <= 1.0 else -dt
     most = np.tile(np.exp(-_WHITE * dt / plain.time_constant), 3)  # positions, speeds, torques
     estimator = OutputError(most=most, progress=task.progress)
     scales = (1.0,) if has_gain.all() else _SCALES
@@ -418,7 +416,7 @@ def _initialise_from_commands(task: _Task) -> _Initial:
         base = first_loops(model, stated, start, typical, finds_limit)
         by_limit = finds_limit | np.isfinite(stated.limit)
         free_parameters = free_drive_parameters(
-            model, loop, groups, base, typical, earliest=earliest,
+            model, loop, groups, base, typical, row=dt,
             finds_kd=finds_kd | by_limit, finds_limit=finds_limit,
         )  # fmt: skip
         free_parameters += free_zeros(model, encoders) if loop.zeros == "find" else []
@@ -452,7 +450,7 @@ def _initialise_from_torque(task: _Task) -> _Initial:
     groups = groups_of(loop, model.joints, range(len(model.joints)))
     none = np.zeros(len(groups), dtype=bool)
     free_parameters = free_drive_parameters(
-        model, loop, groups, base, typical, earliest=0.0, finds_kd=none, finds_limit=none
+        model, loop, groups, base, typical, row=0.0, finds_kd=none, finds_limit=none
     )
     simulator = LoopSimulator(
         robot, windows, base, (*free_parameters, *task.bodies(robot)),
