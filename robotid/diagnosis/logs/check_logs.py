@@ -29,7 +29,8 @@ from robotid.diagnosis.logs.torque_delay import check_torque_delay
 from robotid.diagnosis.urdf.inertials import assumed_inertials, explained_by_assumed, rounded_angles
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.factors import compress, merge
-from robotid.dynamics.prepared_logs import base_problem, independent_share, row_mask
+from robotid.dynamics.prepared_logs import base_problem, independent_share
+from robotid.dynamics.rows import sure_rows
 from robotid.estimation.estimators import WLS, Estimate, determination
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread, with_assumed_inertials
@@ -186,11 +187,9 @@ def check_excitation(
     prior, step = model.standard_parameters(), -(-max(len(m.t) for m in motions) // ROWS)
     thinned = [motion.every(step) for motion in motions]
     try:
-        masks = [row_mask(model, m, signals.min_velocity) for m in thinned]
-        problems = (
-            base_problem(model, mapping, *pair) for pair in zip(thinned, masks, strict=True)
-        )
-        factors = merge([compress(problem) for problem in problems])
+        masks = [sure_rows(model.layout, m.v, signals.min_velocity) for m in thinned]
+        used = zip(thinned, masks, strict=True)
+        factors = merge([compress(base_problem(model, mapping, *motion)) for motion in used])
         wls = WLS(prior=mapping.to_base(prior)).fit(factors)
     except RobotIdError as error:
         yield finding(

@@ -26,7 +26,8 @@ LARGE = {
     "alexander_v1.lowerBodyOnly", "alex_sake_hands", "baxter", "romeo_small", "icub_reduced",
     "talos_reduced_corrected", "talos_reduced_box", "panda_collision", "ur3_joint_limited_robot",
     "ur5_joint_limited_robot", "ur10_joint_limited_robot", "talos_reduced", "ur10_robot",
-    "ur5_gripper", "ur3_gripper", "tiago_no_hand", "simple_humanoid_classical", "laikago",
+    "ur5_gripper", "ur3_gripper", "tiago_no_hand", "simple_humanoid_classical", "laikago", "go1",
+    "solo12",
 }  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 """Where a fit begins: typical sizes, first loops and unknowns, by their equations."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -170,8 +171,9 @@ def test_an_encoder_that_counts_the_other_way_is_turned(leg):
     assert sign[0] == 1.0
 
 
-MASS, LENGTH, KP, VISCOUS, COULOMB, DELAY = 0.5, 0.1, 0.17, 0.03, 0.06, 0.01
+MASS, LENGTH, KP, VISCOUS, COULOMB = 0.5, 0.1, 0.17, 0.03, 0.06
 STEP, RATE = 1e-4, 100.0  # [s] of MuJoCo, [Hz] of the log
+DELAY = 1.0 / RATE  # [s]
 INERTIAL = f"""<inertial><origin xyz="0 0 -{LENGTH}"/><mass value="{MASS}"/>
 <inertia ixx="2e-4" iyy="2e-4" izz="2e-4" ixy="0" ixz="0" iyz="0"/></inertial>"""
 SERVO = f"""<robot name="servo"><link name="base"/><link name="arm">{INERTIAL}</link>
@@ -181,26 +183,38 @@ PLANT = f"""<mujoco><option timestep="{STEP}" integrator="implicitfast"/><worldb
 <joint name="j" axis="0 1 0" armature="1e-3" damping="{VISCOUS}" frictionloss="{COULOMB}"
   solreffriction="2e-4 1" solimpfriction=".9999 .9999 .001 .5 2"/>
 <inertial pos="0 0 -{LENGTH}" mass="{MASS}" diaginertia="2e-4 2e-4 2e-4"/></body></worldbody>
-<actuator><motor joint="j"/></actuator></mujoco>"""
+<actuator><position joint="j" kp="{KP}"/></actuator></mujoco>"""
 
 
-def drooping(seed, duration=20.0, shake=0.0):
-    """Return the log of the servo; its stand turns by ``shake`` [rad] at 2.2 Hz."""
+def followed(seed, follow, duration):
+    """Return the log of the servo: ``follow`` gives its positions by the commands (N,)."""
     rng = np.random.default_rng(seed)
     t = np.arange(round(duration * RATE)) / RATE
     q_ref = multisine(t, np.zeros(1), np.array([3.0]), rng, highest=2.0)
-    robot = mujoco.MjModel.from_xml_string(PLANT)
-    data, q, every, lag = mujoco.MjData(robot), [], round(1 / RATE / STEP), round(DELAY / STEP)
-    command = np.repeat(q_ref[:, 0], every)
-    for k in range(len(command)):
-        if k % every == 0:
-            q.append(data.qpos[0])
-        tilt = shake * np.sin(2 * np.pi * 2.2 * k * STEP)
-        robot.opt.gravity[:] = 9.81 * np.sin(tilt), 0.0, -9.81 * np.cos(tilt)
-        data.ctrl[0] = KP * (command[max(k - lag, 0)] - data.qpos[0])
-        mujoco.mj_step(robot, data)
-    q = np.array(q)[:, None] + 1e-3 * rng.standard_normal(q_ref.shape)
+    q = np.array([*follow(q_ref[:, 0].tolist())])[:, None] + 1e-3 * rng.standard_normal(q_ref.shape)
     return Log(1000.0 + t, q, 0 * q, ("j",), q_ref=q_ref, has_torque=False)
+
+
+def drooping(commands):
+    """Yield positions in MuJoCo, where each command acts a row late."""
+    robot = mujoco.MjModel.from_xml_string(PLANT)
+    data = mujoco.MjData(robot)
+    for command in (commands[0], *commands[:-1]):
+        yield data.qpos[0]
+        data.ctrl[0] = command
+        mujoco.mj_step(robot, data, round(1 / RATE / STEP))
+
+
+def pushed(commands, push=0.05, fade=0.15, step=2e-4):
+    """Yield positions of a servo that compensates friction, at low speed by too much."""
+    inertia, weight, q, v = 1.2e-3 + MASS * LENGTH**2, 9.81 * MASS * LENGTH, 0.0, 0.0
+    for command in commands:
+        yield q
+        for _ in range(round(1 / RATE / step)):
+            friction = COULOMB - (COULOMB + push) * math.exp(-abs(v) / fade)  # [N m]
+            brake = VISCOUS * v + math.tanh(v / 0.01) * friction
+            v += step * (KP * (command - q) - brake - weight * math.sin(q)) / inertia
+            q += step * v
 
 
 @pytest.fixture(scope="module")
@@ -212,7 +226,8 @@ def model(tmp_path_factory):
 
 def test_a_weak_gain_is_found_where_gravity_exceeds_the_drive(model):
     loop, settings = LoopSettings(), SimulationSettings()
-    found = identify_loops(model, [drooping(2)], [], loop, settings, chooses=False)
+    log = followed(2, drooping, 20.0)
+    found = identify_loops(model, [log], [], loop, settings, chooses=False)
     assert (found.fitted[0].rmse < 0.01 * found.fitted[0].spread).all()
     values = dict(zip(found.fit.estimate.names, found.fit.estimate.theta, strict=True))
     wanted = {"j.kp": KP, "j.viscous": VISCOUS, "j.coulomb": COULOMB, "robot.delay": DELAY}
@@ -221,9 +236,10 @@ def test_a_weak_gain_is_found_where_gravity_exceeds_the_drive(model):
 
 
 def test_a_chosen_term_with_negative_friction_is_dropped_and_the_fit_goes_on(model):
-    """On a stand that swings, Stribeck friction would lower the error, but be negative at rest."""
-    log = drooping(1, shake=0.2)
-    found = identify_loops(model, [log], [], LoopSettings(kp=KP), SimulationSettings())
+    """Stribeck friction would lower the error, but be negative at rest."""
+    found = identify_loops(
+        model, [followed(2, pushed, 10.0)], [], LoopSettings(kp=KP), SimulationSettings()
+    )
     [finding] = [f for f in found.findings if f.code.startswith("friction")]
     assert (finding.code, finding.severity, finding.where) == ("friction_dropped", "warning", "j")
     assert "rad, expected 0 or more. The term was dropped" in finding.message
