@@ -412,7 +412,7 @@ def require_finite(
     what = ", which is implausibly large," if np.isfinite(value) else ""
     at = f" (t = {seconds(t[row])} s)" if np.isfinite(t[row]) else ""
     raise DataError(
-        f"{where}: {names[column]} is {found}{what} at row {first + row}{at}; remove the row or "
+        f"{where}: {names[column]} is {found}{what} at row {first + row}{at}; remove such rows or "
         "correct the recording",
         code="not_finite",
     )
@@ -436,7 +436,7 @@ def require_increasing(t: Array, where: str, first: int = 0) -> None:
     if t[k] == t[k - 1]:
         raise DataError(
             f"{where}: t must increase, but t[{row}] = {now} s is a duplicate time stamp, "
-            f"the same as t[{row - 1}]; remove one of the two rows",
+            f"the same as t[{row - 1}]; keep one row of each stamp",
             code="duplicate_stamp",
         )
     raise DataError(

@@ -59,12 +59,12 @@ FAULTS = [
     (dict(t=spoil(T, 406, T[404])), "run3.csv: t must increase, but t[406] = 1004.040 s follows "
      "t[405] = 1004.050 s; sort the rows, or correct the recording"),
     (dict(t=spoil(T, 406, T[405])), "t[406] = 1004.050 s is a duplicate time stamp, the same as "
-     "t[405]; remove one of the two rows"),
+     "t[405]; keep one row of each stamp"),
     (dict(t=spoil(T, 1, T[0] - 1e-7)), "t[1] = 999.9999999 s follows t[0] = 1000.000 s"),
-    (dict(t=spoil(T, 17, np.nan)), "run3.csv: time is NaN at row 17; remove the row or correct"),
+    (dict(t=spoil(T, 17, np.nan)), "run3.csv: time is NaN at row 17; remove such rows or correct"),
     (dict(t=T[:, None]), "run3.csv: t has shape (500, 1), expected (N,)"),
     *[({name: spoil(getattr(LOG, name), (34, 1), value)},
-       f"run3.csv: {column}_elbow is {word} at row 34 (t = 1000.34 s); remove the row or correct")
+       f"run3.csv: {column}_elbow is {word} at row 34 (t = 1000.34 s); remove such rows or correct")
       for name, column in (("q", "q"), ("v", "dq"), ("a", "ddq"), ("tau", "tau"))
       for value, word in ((np.nan, "NaN"), (-np.inf, "-inf"))],
     (dict(q_ref=spoil(LOG.q, (7, 1), np.nan)), "qref_elbow is NaN at row 7"),

@@ -134,7 +134,7 @@ class _CsvRows(RowReader):
         end = "" if cell.strip() or hint else f", or {other}"
         return DataError(
             f"{self.path.name}: {name} is {repr(cell[:80]) if cell.strip() else 'empty'} at row "
-            f"{row}, expected a number{hint}; remove the row or correct the recording{end}"
+            f"{row}, expected a number{hint}; remove such rows or correct the recording{end}"
         )
 
 

@@ -310,8 +310,8 @@ CSV_FAULTS = [
     ("time,q_a,q_a,tau_a\n0,1,2,3\n1,1,2,3\n", "has more than one column q_a; rename or remove"),
     (HEADER + ROWS + "0.2,1.", ": line 4 has 2 cells, the header has 3; correct it"),
     (HEADER + "0.0,1.0,2.0,9.0\n" + ROWS, ": line 2 has 4 cells, the header has 3; correct it"),
-    (HEADER + ROWS + "0.2,abc,3.0\n", ": q_a is 'abc' at row 2, expected a number; remove the row"),
-    (HEADER + ROWS + "0.2,1.0,\n", ": tau_a is empty at row 2, expected a number; remove the row "
+    (HEADER + ROWS + "0.2,abc,3.0\n", ": q_a is 'abc' at row 2, expected a number; remove such"),
+    (HEADER + ROWS + "0.2,1.0,\n", ": tau_a is empty at row 2, expected a number; remove such rows "
      "or correct the recording, or interpolate a column of another rate at the joints' stamps"),
     ('time,q_a,tau_a\n"0,0","1,0","2,0"\n', ": time is '0,0' at row 0, expected a number; write "
      "decimals with a point; remove"),

@@ -204,7 +204,7 @@ REFUSED = {
         "torque of shoulder was found; if at rest, lock", "with --lock shoulder=0. A payload"),
     "no gains, no positions": (NO_Q | NO_TAU | dict(i_elbow=ONE), {}, "no columns 'q_shoulder', "),
     "NaN": (dict(tau_elbow=spoilt(T, 34, np.nan)), {}, "log: tau_elbow is NaN at row 34 (t = 1000.3"
-            "4 s); remove the row or correct the recording"),
+            "4 s); remove such rows or correct the recording"),
     "huge": (dict(q_elbow=spoilt(T, 9, 1e308)), {}, "q_elbow is 1e+308, which is implausibly larg"),
     "text": (dict(tau_elbow=["much"] * 300), {}, "column 'tau_elbow' contains", "convert it"),
     "far": (dict(q_elbow=20 * LOG.q[:, 1]), {}, "q_elbow reaches 20, which looks like degrees"),
@@ -413,7 +413,7 @@ def test_faults_of_a_base_and_of_cells_of_a_foot_are_named(tmp_path):
 
     read_log(pd.DataFrame(table | {"base_yaw": 30.0 * t}), ["a"], base=wanted)  # full turns
     lost = np.where(np.arange(90) == 7, np.nan, t)
-    refused(r"log: base_z is NaN at row 7 \(t = 2.07 s\); remove the row", base_z=lost)
+    refused(r"log: base_z is NaN at row 7 \(t = 2.07 s\); remove such rows", base_z=lost)
     refused(r"log: wrench_fz_f is NaN at row 7", wrench_fz_f=lost)
     refused(r"base_roll and base_pitch are up to 20, expected at most", base_pitch=t[-1] - t - 20)
     cells = {"wrench_fz_f": None, "wrench_fz_f_0": t, "wrench_fz_f_1": t}
