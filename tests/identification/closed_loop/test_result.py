@@ -102,8 +102,6 @@ def test_encoders_are_told_with_the_figures_of_their_own_joint(found):
         said = loop_findings(replace(found, fit=fit, loop=loop), ())
         return {f.code: f for f in said if f.code.startswith("encoder")}
 
-    [open_] = told(margin=[0.13, 0.05]).values()
-    assert open_.evidence == {"margin": 0.13}
     [open_] = told(margin=[0.05, 0.13]).values()
     assert (open_.where, open_.evidence) == ("rail, turn", {"margin": 0.13})
     assert "leaves at most 13 % more squared position error" in open_.message
@@ -115,9 +113,7 @@ def test_encoders_are_told_with_the_figures_of_their_own_joint(found):
     said = every["encoder"].message
     assert "opposite sign and reads 0" in said
     assert "The next best, -0.25 rad and the other sign, leaves 210 % more" in said
-    kept = every["encoder_uncorrected"].message
-    assert "explains 62 % of the slow part" in kept
-    assert "The next best, +0.4 rad leaves 50 % more" in kept
+    assert "explains 62 % of the slow part" in every["encoder_uncorrected"].message
 
 
 def test_speeds_of_a_log_are_those_between_its_gaps():
