@@ -36,7 +36,7 @@ from robotid.dynamics.torque import (
     torque_rate,
 )
 from robotid.estimation.fitting.fitted import Fit
-from robotid.robot.model import GRAVITY, RobotModel
+from robotid.robot.model import RobotModel
 
 _SPLINES = 40  # largest number of B-splines in time ...
 _BLOCKS = 3  # ... and blocks that are held out, of one of them
@@ -147,13 +147,12 @@ def _of_robot(
 
     one, every = [(joint,) for joint in model.joints], [tuple[str, ...]()]
     level = every if down.any() else []
-    least = 0.02 * float(np.linalg.norm(GRAVITY)) * pi[: model.layout.n_inertial : 10].sum()
     return (
         Reading("gravity", 0.025, level, lambda on: by.by_gravity @ across.T, tilted),
         Reading("moving_gravity", 0.025, level, lambda on: g * by.by_gravity, changes=True),
         Reading("moving_gravity", 0.025, level, weighed, changes=True),
-        Reading("external_force", least, every, push),
-        Reading("external_force", least, every, push, changes=True),
+        Reading("external_force", 0.0, every, push),
+        Reading("external_force", 0.0, every, push, changes=True),
         Reading("joint_origin", 0.01, one, lambda on: by.by_origin[:, :, on > 0].reshape(shape)),
         Reading(
             "axis_direction:residual", 0.03, one,
@@ -450,7 +449,7 @@ def _accepted(
         unit = "m" if model.layout.prismatic.intersection(best.joints) else "rad"
         norm, norm_error = float(np.linalg.norm(size)), float(np.linalg.norm(error))
         angle, angle_error = np.degrees(np.arctan([norm, norm_error]))
-        if len(size) == 1 or not least:  # the mass of a load
+        if len(size) == 1 or best.reading.code == "payload":  # its mass
             norm, norm_error = float(size[0]), float(error[0])
         explained = finding(
             f"log_differs:{best.reading.code}" if log else best.reading.code, log, best.joints,

@@ -313,7 +313,7 @@ def _explains(term: Finding, hypothesis: Finding) -> bool:
     shares = [term.evidence.get(key, np.inf) for key in ("share_pct", "validation_share_pct")]
     if "share_pct" not in term.evidence or min(shares) < decisions.MAIN:
         return False
-    if hypothesis.code == "unexplained_torque":
+    if hypothesis.code in ("unexplained_torque", "torque_delay"):
         return not term.joints or hypothesis.joints == term.joints
     if hypothesis.code in _OF_MASSES and "gain" not in hypothesis.evidence:  # no certain reading
         return term.code in (*_OF_POSITION, *_OF_FORCE)
