@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from robotid.base.exceptions import SettingsError
-from robotid.base.findings import Finding, listed, not_ignored, quoted, suggestion
+from robotid.base.findings import Finding, grouped, listed, not_ignored, quoted, suggestion
 from robotid.base.settings import require_kind
 from robotid.diagnosis.catalogue import codes_with, reason_of, sentence_of
 from robotid.diagnosis.decisions import BETTER, NO_ERROR_OF_MASSES
@@ -481,9 +481,11 @@ def warnings_of(
 ) -> tuple[VerdictWarning, ...]:  # fmt: skip
     """Return the warnings of a verdict that follow from findings, each once."""
     jumps = {(f.log, f.joints) for f in findings if is_robust and is_downweighted(f)}
-    warnings: list[VerdictWarning] = []
     known = {*codes_with("verdict")} - {"repeated_motion"}
-    for one in (one for one in findings if one.severity == "warning" and one.code in known):
+    warned = [one for one in findings if one.severity == "warning" and one.code in known]
+    bodies = grouped(one for one in warned if one.code in codes_with("of_body"))
+    warnings = [VerdictWarning(x.code, "", text) for x in bodies for text in x.messages]
+    for one in (one for one in warned if one.code not in codes_with("of_body")):
         # the unexplained torque is the spikes, which a robust fit downweights
         is_jump = one.code == "unexplained_torque" and (one.log, one.joints) in jumps
         if not is_jump and not _is_harmless(one):
@@ -517,9 +519,6 @@ def _shared(reasons: Iterable[tuple[str, str]]) -> list[str]:
 
 def _warnings(finding: Finding, joints: Sequence[str]) -> Iterator[VerdictWarning]:
     message, named = reason_of(finding), [x for x in finding.joints if x in joints]
-    if finding.code in codes_with("of_body"):
-        yield VerdictWarning(finding.code, "", message)
-        return
     factor, costs = finding.evidence.get("factor", 1.0), finding.evidence.get("error_pct", 0.0)
     is_poor = {
         "constraint_costs": costs > COSTLY,

@@ -3,6 +3,7 @@ from dataclasses import replace
 import pytest
 
 from robotid.base.findings import Finding
+from robotid.diagnosis import catalogue
 from robotid.diagnosis.verdict.scale_check import ScaleCheck, StatedMass
 from robotid.diagnosis.verdict.verdict import (
     Determined,
@@ -142,6 +143,13 @@ def test_an_impossible_body_makes_the_result_usable_and_no_joint(code):
     assert concluded.status == "usable"
     assert concluded.reasons == (f"the mass of a is 40 kg: not possible ({code})",)
     assert {own.status for own in concluded.joints.values()} == {"good"}
+
+
+def test_impossible_bodies_are_one_reason():
+    words = {"error": False, "needs": "none", "conclusion": False, "cure": "pin it", "mass": 4.0}
+    bodies = [catalogue.finding("dense_body", subject=f"link {x}", link=x, **words) for x in "ab"]
+    (warning,) = warnings_of(bodies, JOINTS)
+    assert warning.message.startswith("as identified, the mass of a, b is 4 kg and its inertia")
 
 
 @pytest.mark.parametrize(
