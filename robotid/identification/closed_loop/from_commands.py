@@ -410,7 +410,7 @@ def _of_fit(result: PositionIdentification, *, is_explained: bool) -> Iterator[F
     yield from _unequal_gains(result)
     yield from _encoder_findings(result)
     for tried in result.fit.tried:
-        figures: Any = {"terms": " and ".join(tried.terms), "gain_pct": 100 * tried.gain}
+        figures: Any = {"terms": " and ".join(tried.terms), "gain_pct": min(100 * tried.gain, 100)}
         if tried.dropped and not is_explained:
             yield finding("friction_dropped", "", tried.joint, **figures, dropped=tried.dropped)
         elif tried.is_chosen:
