@@ -43,6 +43,7 @@ from robotid.estimation.variation.variation import PLAUSIBLE, vary
 from robotid.identification.closed_loop.initial_values import CLEAR, parallel_axes
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.loop_simulator import (
+    POSITIVE,
     FreeParameter,
     LoopSimulator,
     with_terms,
@@ -70,11 +71,11 @@ _LEAST = 0.01  # plausible change between logs, at least, over the prior standar
 #: With these no result is good.
 _CAUTIONS = (
     "at_bound", "coarse_steps", "end_stop", "gains_contradicted", "not_followed", "other_gains",
+    "position_offset",
 )  # fmt: skip
 _MOVING = 0.05  # smallest speed above the noise, relative to the largest speed of a joint
 _MISMATCH = 0.5  # largest relative error of a torque that the loop of its joint gives
 _KNOWN = 0.1  # standard error of a known delay, relative to the range found from one response
-_POSITIVE = ("kp", "limit")  # parameters whose lower bound is more than 0
 #: Figures of a log's gains relative to the fit; that of kd is 0 where the fit has none.
 _GAINS = {"kp": "ratio", "kd": "kd_ratio"}
 _UNEQUAL = 3.0  # ratio of the gains of equal drives from which on they are reported
@@ -275,8 +276,7 @@ def with_gravity(model: RobotModel, log: Log) -> Log:
 def driven_log(model: RobotModel, log: Log, signals: SignalSettings) -> Log:
     """Return a log whose feed-forward torque is the measured one, and its position the command."""
     # constant between two rows: the mean of the two, which avoids a delay of half a row
-    free = np.array([joint.turns_freely for joint in model.limits])
-    log = unwrap(log, free)
+    log = unwrap(log, np.array([joint.turns_freely for joint in model.limits]))
     measured = np.column_stack(
         [np.interp(log.t + signals.torque_delay, log.t, tau) for tau in log.tau.T]
     )
@@ -361,7 +361,7 @@ def loop_findings(
     # Bodies connect the joints: a cause that the logs show explains what the fit finds of others.
     settled, found = [_settled_delay(one, result) for one in examined], list[Finding]()
     causes = [one for one in settled if one.code in codes_with("names_cause")]
-    causes += _limits_found(result)
+    causes += (one for one in _of_drives(result) if one.code != "no_delay")
     if result.has_gains and all(one.severity == "note" for one in causes):
         with suppress(NotConvergedError, DataError):  # a log that cannot be simulated, or is short
             found.extend(_other_gains(result))
@@ -406,7 +406,7 @@ def _of_fit(result: PositionIdentification, *, is_explained: bool) -> Iterator[F
     at_rest = [x.name for x in friction if not moves[list(x.joints)].any()]
     if left := [name for name in at_rest if name not in names]:
         yield _named("undetermined:rest", left)
-    yield from _limits_found(result)
+    yield from _of_drives(result)
     yield from _unequal_gains(result)
     yield from _encoder_findings(result)
     for tried in result.fit.tried:
@@ -429,12 +429,9 @@ def _settled_delay(examined: Finding, result: PositionIdentification) -> Finding
         return examined
     estimate, free_parameters = result.estimate, result.fit.simulator.free_parameters
     errors = estimate.std_error[[free.what == "delay" for free in free_parameters]].tolist()
-    if any(name.endswith("delay") for name in estimate.details["at_bound"]):
-        known = "its standard error belongs to the bound, not to the delay"
-        remedy = f"{examined.remedy}. The delay of the fit is 0, its lower bound: {known}"
-        return examined.reworded(remedy=remedy)
+    is_at_bound = any(name.endswith("delay") for name in estimate.details["at_bound"])
     error = max(errors, default=0.0)
-    if error > _KNOWN * examined.evidence["longest"]:
+    if is_at_bound or error > _KNOWN * examined.evidence["longest"]:
         return examined
     what, figures = "fitted" if errors else "stated", {**examined.evidence, "std_error": error}
     return finding("slow_command:known", examined.log, examined.joints, what=what, **figures)
@@ -442,28 +439,22 @@ def _settled_delay(examined: Finding, result: PositionIdentification) -> Finding
 
 def _at_bound(result: PositionIdentification, *, is_explained: bool) -> Iterator[Finding]:
     """Yield which parameters are estimated at a bound, and what to do about it."""
-    loop, estimate = result.loop, result.estimate
-    free_parameters, at_bound = result.fit.simulator.free_parameters, estimate.details["at_bound"]
+    estimate, free_parameters = result.estimate, result.fit.simulator.free_parameters
     values = zip(free_parameters, estimate.theta.tolist(), strict=True)
     largest = {free.name: free.highest for free, value in values if value >= free.highest}
     if largest:
         yield _named("at_bound:largest", [f"{name} = {x:g}" for name, x in largest.items()])
-    least = {
-        free.name: free.lowest
-        for free in free_parameters
-        if free.what in _POSITIVE and free.name in at_bound
-    }
-    if at_zero := [name for name in at_bound if name not in {**largest, **least}]:
-        stated = [name for name in ("kp", "kd", "delay") if getattr(loop, name) is not None]
+    others = [x for x in free_parameters if x.name in {*estimate.details["at_bound"]} - {*largest}]
+    least = [f"{x.name} = {x.lowest:.3g}" for x in others if x.what in POSITIVE]
+    if at_zero := [x.name for x in others if x.what not in (*POSITIVE, "delay")]:
+        stated = [x for x in ("kp", "kd", "delay") if getattr(result.loop, x) is not None]
         gains = [name for name in stated if name != "delay"]
         is_wrong = bool(stated) and not is_explained
         words = {"stated": " or ".join(stated), "own": " and ".join(gains)}
         todo = {"gains": is_wrong and bool(gains), "late": "delay" in stated}
         yield _named("at_bound:zero", at_zero, wrong=is_wrong, **words, **todo)
     if least:
-        yield _named("at_bound:least", [f"{name} = {x:.3g}" for name, x in least.items()])
-    if any(name.endswith("delay") for name in at_zero):
-        yield finding("no_delay", subject="delay")
+        yield _named("at_bound:least", least)
 
 
 def _unequal_gains(result: PositionIdentification) -> Iterator[Finding]:
@@ -531,15 +522,25 @@ def _relative_errors(run: PositionEvaluation) -> Array:
     return 100.0 * np.divide(run.rmse, run.spread, where=run.moves, out=np.zeros(len(run.rmse)))
 
 
-def _limits_found(result: PositionIdentification) -> Iterator[Finding]:
-    """Yield the estimated torque limits of the drives, except those at a bound."""
-    estimate, free_parameters = result.estimate, result.fit.simulator.free_parameters
-    severity = "note" if result.loop.limit == "find" else "warning"
-    for free, value, error in zip(free_parameters, estimate.theta, estimate.std_error, strict=True):
-        if free.what == "limit" and free.name not in estimate.details["at_bound"]:
-            joint, figures = result.model.joints[free.joints[0]], {"std_error": error}
-            figures |= {"limit": value, "unit": units_of(result.model, free)}
-            yield finding("limit", "", joint, severity=severity, **figures)
+def _of_drives(result: PositionIdentification) -> Iterator[Finding]:
+    """Yield what the estimated limits, delays and offsets of the drives say."""
+    model, estimate, free = result.model, result.estimate, result.fit.simulator.free_parameters
+    away = [run.log.q_ref - run.log.q for run in result.fitted if run.log.q_ref is not None]
+    for x, value, error in zip(free, estimate.theta, estimate.std_error, strict=True):
+        joint, is_bound = model.joints[x.joints[0]], x.name in estimate.details["at_bound"]
+        figures: Any = {"std_error": error, "unit": units_of(model, x)}
+        if x.what == "limit" and not is_bound:
+            severity = "note" if result.loop.limit == "find" else "warning"
+            yield finding("limit", "", joint, severity=severity, limit=value, **figures)
+        elif x.what == "delay" and (is_bound or value < -QUANTILE * error):
+            code = "no_delay" if is_bound else "no_delay:early"
+            yield finding(code, subject=x.name, delay=value)
+        elif x.term == TERMS["offset"] and result.has_gains:
+            kp = float(result.fit.loops.kp[x.joints[0]])
+            if abs(value) > np.sqrt(np.mean((kp * np.vstack(away)[:, x.joints] - value) ** 2)):
+                figures |= {"torque": value, "offset": value / kp}
+                length = "m" if joint in model.layout.prismatic else "rad"
+                yield finding("position_offset:commands", "", joint, length=length, **figures)
 
 
 def _encoder_findings(result: PositionIdentification) -> Iterator[Finding]:

@@ -26,6 +26,7 @@ from robotid.estimation.estimators.output_error import OutputError
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.loop_simulator import (
     LONGEST_DELAY,
+    POSITIVE,
     FreeParameter,
     LoopSimulator,
     terms_of,
@@ -298,11 +299,12 @@ def free_drive_parameters(
     base: Loops,
     typical: TypicalSizes,
     *,
+    row: float,
     finds_kd: Array,
     finds_limit: Array,
 ) -> list[FreeParameter]:
     """Return the free parameters of drives and loops, with initial values from ``base``."""
-    # finds_kd (n,), finds_limit (n,)
+    # row of the logs [s], finds_kd (n,), finds_limit (n,)
     members: dict[str, list[int]] = {}
     for j, group in enumerate(groups):
         members.setdefault(group, []).append(j)
@@ -312,6 +314,8 @@ def free_drive_parameters(
     delayed = {"robot": [*range(len(groups))]} if loop.delays == "one" else members
     has_armature = np.full(len(groups), "armature" in model.layout.terms)
     closed_kp, closed_delay = (~is_stated(x, model) & is_closed for x in (loop.kp, loop.delay))
+    # a command that is not held over a row, as between the ticks of a slow clock, acts earlier
+    earliest = -row if loop.rate is None or loop.rate * row > 1.0 else 0.0
     found = []
     for what, sharing, is_free, spread in (
         ("armature", members, has_armature, typical.inertia),
@@ -325,7 +329,7 @@ def free_drive_parameters(
             if sharers:
                 initial = float(np.median(getattr(base, what)[sharers]))
                 wide = WEAK_PRIOR * float(np.median(spread[sharers]))
-                lowest = _LEAST * initial if what in ("kp", "limit") else 0.0
+                lowest = earliest if what == "delay" else _LEAST * initial * (what in POSITIVE)
                 found.append(
                     FreeParameter(f"{name}.{what}", what, tuple(sharers), initial, wide, lowest)
                 )

@@ -43,6 +43,7 @@ from robotid.robot.prior import with_assumed_inertials
 
 #: Largest delay that is tried [s].
 LONGEST_DELAY = 0.1
+POSITIVE = ("kp", "limit")  # parameters whose lower bound is more than 0
 
 _WHOLE = 0.15  # distance from a whole lag below which the lag is whole [samples]
 _SMOOTH = 0.02  # half-width of the differentiating filter [s]

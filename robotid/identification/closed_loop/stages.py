@@ -416,7 +416,7 @@ def _initialise_from_commands(task: _Task) -> _Initial:
         base = first_loops(model, stated, start, typical, finds_limit)
         by_limit = finds_limit | np.isfinite(stated.limit)
         free_parameters = free_drive_parameters(
-            model, loop, groups, base, typical,
+            model, loop, groups, base, typical, row=dt,
             finds_kd=finds_kd | by_limit, finds_limit=finds_limit,
         )  # fmt: skip
         free_parameters += free_zeros(model, encoders) if loop.zeros == "find" else []
@@ -450,7 +450,7 @@ def _initialise_from_torque(task: _Task) -> _Initial:
     groups = groups_of(loop, model.joints, range(len(model.joints)))
     none = np.zeros(len(groups), dtype=bool)
     free_parameters = free_drive_parameters(
-        model, loop, groups, base, typical, finds_kd=none, finds_limit=none
+        model, loop, groups, base, typical, row=0.0, finds_kd=none, finds_limit=none
     )
     simulator = LoopSimulator(
         robot, windows, base, (*free_parameters, *task.bodies(robot)),

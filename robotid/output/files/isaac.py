@@ -78,7 +78,7 @@ def isaac_actuators(
 
 
 def _fields(drive: CommandedDrive, joint: Joint, physics_dt: float) -> dict[str, Any]:
-    steps = round(drive.delay / physics_dt)
+    steps = max(0, round(drive.delay / physics_dt))
     return {
         "effort_limit": _limit(limit_of(drive, joint)),
         "velocity_limit": _limit(joint.velocity),

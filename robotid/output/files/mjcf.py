@@ -103,7 +103,7 @@ class _Servos:
         if not self.of:
             return []
         notes = ["controls are position commands, joint positions are encoder readings [rad, m]"]
-        delays = {name: drive.delay for name, drive in self.of.items() if drive.delay}
+        delays = {name: drive.delay for name, drive in self.of.items() if drive.delay > 0}
         if delays and self.delay == "filter":
             notes.append(
                 "delays are first-order filters with the delay as time constant; their initial "
@@ -130,9 +130,9 @@ class _Servos:
         }
         if (limit := limit_of(drive, joint)) < np.inf:  # of the drive, before the offset
             at["forcerange"] = numbers_text([-limit - offset, limit - offset])
-        if drive.delay and self.delay == "filter":
+        if drive.delay > 0 and self.delay == "filter":
             at |= {"dyntype": "filterexact", "dynprm": numbers_text([drive.delay, 0.0, 0.0])}
-        elif drive.delay:
+        elif drive.delay > 0:
             delay = max(drive.delay + 0.5 * self.step, self.step)  # MuJoCo's minimum is a step
             samples = str(math.ceil(round(delay / self.step, 9)))
             at |= {"delay": numbers_text([delay]), "nsample": samples, "interp": "linear"}

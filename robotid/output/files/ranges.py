@@ -189,7 +189,7 @@ def _range(
     is_positive: bool = False,
 ) -> dict[str, Any]:
     """Return the range of a value; without ends if its standard error is infinite."""
-    nominal, half = float(value), quantile * float(error)
+    nominal, half = max(float(value), least), quantile * float(error)  # a delay may be below 0
     if not math.isfinite(half):
         return {"nominal": nominal, "source": source}
     low = nominal * math.exp(-half / nominal) if is_positive else max(nominal - half, least)
@@ -320,7 +320,7 @@ def _quantile(content: Mapping[str, Any]) -> float:
 
 def _nominal(result: Result, names: list[str]) -> list[float]:
     stated = {entry["name"]: float(entry["value"]) for entry in result.content["drive_parameters"]}
-    return [stated[name] for name in names]
+    return [max(stated[x], 0.0) if x.endswith(".delay") else stated[x] for x in names]
 
 
 def _bodies(model: RobotModel, values: Array) -> dict[str, Any]:

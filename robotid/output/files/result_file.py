@@ -51,7 +51,7 @@ class CommandedDrive:
     joint: str
     kp: float  # proportional gain [N m/rad or N/m]
     kd: float  # derivative gain [N m s/rad or N s/m]
-    delay: float  # delay of the command [s]
+    delay: float  # delay of the command, held from row to row [s]; negative: it is not held
     zero: float  # position of the URDF's joint at which the encoder reads 0 [rad or m]
     armature: float  # inertia of the rotor, reflected to the joint [kg m^2 or kg]
     viscous: float  # viscous friction [N m s/rad or N s/m]
@@ -77,7 +77,6 @@ def commanded_drives(
         for term, wanted, is_right in (
             ("kp", "more than 0", stated[f"{joint}.kp"] > 0),
             ("kd", "0 or more", stated.get(f"{joint}.kd", 0.0) >= 0),
-            ("delay", "0 or more", stated.get(f"{joint}.delay", 0.0) >= 0),
         ):
             if not is_right:
                 value = stated[f"{joint}.{term}"]

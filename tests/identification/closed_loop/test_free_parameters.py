@@ -88,20 +88,13 @@ def test_slopes_of_residuals_are_those_of_differences(simulator, rng, compared):
         np.testing.assert_array_equal(one.e, bare.e)
         np.testing.assert_array_equal(one.joints, bare.joints)
     for k, name in enumerate(simulator.names):
-        h = 1e-8 / max(np.abs(slopes[:, :3, k]).max(), 1e-4)
-        if compared == "all":
-            h = 3e-8 / max(np.abs(slopes[:, -3:, k]).max(), 1e-2)
-        ends = []
-        for s in (1, -1):
-            moved = theta.copy()
-            moved[k] += s * h
-            ends.append(
-                np.concatenate([r.e for r in simulator.residuals(moved, with_slopes=False)])
-            )
-        exact = -(ends[0] - ends[1]) / (2 * h)
-        close, least = 1e-5, 1e-6
-        if compared == "all":  # by a wider step, too wide for a limit's positions
-            close, least = 1e-4, 1e-3
+        h, close, least = 1e-8 / max(np.abs(slopes[:, :3, k]).max(), 1e-4), 1e-5, 1e-6
+        if compared == "all":  # a wider step, too wide for a limit's positions
+            h, close, least = 3e-8 / max(np.abs(slopes[:, -3:, k]).max(), 1e-2), 1e-4, 1e-3
+        step = h * np.eye(len(theta))[k]
+        ends = [simulator.residuals(theta + s * step, with_slopes=False) for s in (1, -1)]
+        before, after = (np.concatenate([r.e for r in end]) for end in ends)
+        exact = -(before - after) / (2 * h)
         size = np.maximum(np.abs(exact).max(axis=0), least)
         size = np.repeat(size.reshape(-1, 3).max(axis=1), 3)  # of positions, speeds, torques
         assert (np.abs(slopes[..., k] - exact).max(axis=0) <= close * size).all(), name

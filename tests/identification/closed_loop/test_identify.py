@@ -93,6 +93,22 @@ def test_drives_behind_a_slow_clock_are_recovered_once_it_is_stated(rng):
     assert worst[None][0] > 0.2
 
 
+def test_a_command_that_goes_on_between_its_rows_is_early(rng):
+    """Of commands held for 2 ms every fifth is logged: 10 ms held would be 4 ms later."""
+    robot = plant("planar", rng, delay=0.0)
+    log, truth = recorded(robot, rng, duration=2.0, noise=1e-4)
+    q, q_ref = log.q[::5], log.q_ref[::5]
+    log = Log(log.t[::5], q, 0 * q, robot.model.joints, q_ref=q_ref, has_torque=False)
+    loop = stated(robot, delays="one")
+    found = identify_loops(robot.model, [log], [], loop, COARSE, chooses=False)
+    [early] = [f for f in found.findings if f.code == "no_delay"]
+    assert (early.severity, early.where) == ("note", "robot.delay")
+    assert early.evidence["delay"] == pytest.approx(-4.25e-3, abs=2e-4), "and half a step"
+    values = zip(found.estimate.theta, found.estimate.std_error, strict=True)
+    for name, (value, error) in zip(found.estimate.names, values, strict=True):
+        assert name == "robot.delay" or abs(value - truth[name]) < 4.0 * error, name
+
+
 def test_the_drives_of_an_arm_are_recovered_with_steps_that_are_halved():
     """From commands that last as long as the steps to begin with, which are too long by far."""
     rng = np.random.default_rng(1)
@@ -240,11 +256,27 @@ def test_a_delay_at_its_bound_leaves_the_warning_of_a_slow_command(found):
     bound = replace(found, fit=fitted)
     named = {one.code: one for one in loop_findings(bound, [SLOW])}
     assert named["slow_command"].severity == "warning"
-    assert "or steps. The delay of the fit is 0" in named["slow_command"].message
-    assert "the data do not determine it" in named["no_delay"].message
+    assert named["no_delay"].severity == "warning"
+    assert "its lower bound, one row" in named["no_delay"].message
     entries = build_result(bound, {"estimator": {"name": "simulation"}})["drive_parameters"]
     sources = {e["source"] for e in entries if e["name"].endswith(".delay")}
     assert "bound" in sources
+
+
+def test_a_zero_that_position_and_command_do_not_share_is_named(leg, found):
+    """A constant torque of a drive above all its other torques is kp times the difference."""
+    drive, names = leg[0].drives[1], found.estimate.names
+    for offset, wanted in ((0.2, [0.2]), (-0.2, [-0.2]), (0.01, [])):
+        theta, away = found.estimate.theta.copy(), offset * np.eye(3)[1]
+        theta[names.index(f"{drive.joint}.offset")] += drive.kp * offset
+        runs = [replace(x, log=replace(x.log, q_ref=x.log.q_ref + away)) for x in found.fitted]
+        fit = replace(found.fit, estimate=replace(found.estimate, theta=theta))
+        other = replace(found, fit=fit, fitted=tuple(runs))
+        other = replace(other, findings=loop_findings(other, ()))
+        named = {f.where: f for f in other.findings if f.code == "position_offset"}
+        assert [*named] == [drive.joint] * len(wanted)
+        assert [f.evidence["offset"] for f in named.values()] == pytest.approx(wanted, abs=0.01)
+        assert (other.verdict.status == "good") == (not named)
 
 
 RATIOS = np.array([[1.0, 3.0, 1 / 3], [1.0, 2.0, 1 / 3]])  # of kp and kd

@@ -35,9 +35,8 @@ def test_a_load_that_would_push_a_loop_the_wrong_way_does_not_count(rng):
     model = RobotModel.from_urdf(URDF / "planar_2r.urdf", gravity=(0.0, -9.81, 0.0))
     q, v, a = rng.uniform(-1.0, 1.0, (3, 60, 2))
     sign, zero = np.array([-1.0, 1.0]), np.array([0.3, -0.4])
-    torque = predict_instants(
-        model, model.standard_parameters(), sign * q + zero, sign * v, sign * a
-    )
+    state = sign * q + zero, sign * v, sign * a
+    torque = predict_instants(model, model.standard_parameters(), *state)
     sense, noise = np.tanh(v), 1e-3 * rng.standard_normal((60, 2))
     gives = sign * torque * [0.02, 0.05] + 0.1 * v - 0.2 * a + 0.3 * sense + 0.7 + noise
     for way, counts in (([1.0, 1.0], [1, 1]), ([1.0, -1.0], [1, 0]), ([-1.0, 1.0], [0, 1])):
@@ -116,9 +115,8 @@ def moved(leg):
 
 def test_encoders_with_the_zeros_of_the_urdf_keep_them(leg):
     found = find_encoders(leg[0].model, [leg[1]])
-    np.testing.assert_array_equal(found.zero, 0.0)
-    np.testing.assert_array_equal(found.sign, 1.0)
-    np.testing.assert_array_equal(found.gain, 0.0)
+    for values, wanted in ((found.zero, 0.0), (found.sign, 1.0), (found.gain, 0.0)):
+        np.testing.assert_array_equal(values, wanted)
     assert (found.margin[:2] > CLEAR).all()
     assert 0.0 <= found.margin[2] < CLEAR, "the calf bears little"
     assert (found.explained[:2] > 0.3).all()

@@ -90,7 +90,7 @@ def test_mujoco_follows_a_chirp_as_the_closed_loop_does(changes, commands):
         assert np.abs(missed - wanted).max() > 2e-3, key
 
 
-@pytest.mark.parametrize("late", [0.0, 0.0002, 0.0004, 0.003, 0.0063, 0.0100001])
+@pytest.mark.parametrize("late", [-0.0025, 0.0, 0.0002, 0.0004, 0.003, 0.0063, 0.0100001])
 def test_a_delay_is_exact_to_a_step(late):
     """A force at the beginning of a step acts half a step early, so it lags by half a step more."""
     step, leg = 0.001, plant("leg", np.random.default_rng(0), delay=late, coulomb=0.0)
@@ -103,7 +103,8 @@ def test_a_delay_is_exact_to_a_step(late):
         data.qpos[:] = data.qvel[:] = 0.0
         forces.append(data.actuator_force[0])
     lag = np.arange(40) - 100 * np.array(forces) / leg.drives[0].kp
-    np.testing.assert_allclose(lag[20:], max(late / step + 0.5, 1.0) if late else 0.0, atol=1e-9)
+    wanted = max(late / step + 0.5, 1.0) if late > 0 else 0.0
+    np.testing.assert_allclose(lag[20:], wanted, atol=1e-9)
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +154,7 @@ def test_impossible_drives_are_refused(result, tmp_path):
     one = f"{LEG[1]}.kp"
     with pytest.raises(DataError, match=f"has gains of some joints, but no kp of {LEG[1]}"):
         _ = with_entries(lambda e: None if e["name"] == one else e).commanded
-    for name, wrong, wanted in ((one, 0.0, "more than 0"), (f"{LEG[1]}.delay", -1e-3, "0 or more")):
+    for name, wrong, wanted in ((one, 0.0, "more than 0"), (f"{LEG[1]}.kd", -1e-3, "0 or more")):
         changed = with_entries(
             lambda e, n=name, x=wrong: e | ({"value": x} if e["name"] == n else {})
         )
@@ -240,9 +241,10 @@ def test_isaac_actuators_are_grouped_and_read_back(result, tmp_path, capsys):
             "max_delay": 3 if joint != LEG[2] else 2,
         }
     names = ("hip.1", "hip_1", "knee")  # each group matches its own joints alone
-    others = [replace(drive, joint=name) for drive, name in zip(drives, names, strict=True)]
+    others = [replace(d, joint=name, delay=-4e-3) for d, name in zip(drives, names, strict=True)]
     for group in isaac_actuators(model, others, 0.002)["actuators"].values():
         (pattern,) = group["joint_names_expr"]
+        assert group["min_delay"] == group["max_delay"] == 0
         assert sum(re.fullmatch(pattern, name) is not None for name in names) == 1
 
 
