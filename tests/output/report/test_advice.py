@@ -47,23 +47,15 @@ def words(steps):
 def test_every_command_is_one_that_the_program_takes(identified):
     codes = ["current_for_torque", "torque_delay", "unexplained_torque", "undetermined"]
     codes += ["zero_mass", "repeated_motion", "spikes", *NAMED, "locked_position"]
-    typed, known = 0, set()
-    for origin in (JOB, FLAGS):
-        for found in (
-            told(identified),
-            *(told(identified, warning(code, delay=0.01)) for code in codes),
-        ):
-            for step in next_steps(found, origin):
-                for block in step.blocks:
-                    typed += block.startswith("robotid")
-                    if block in known:
-                        continue
-                    known.add(block)
-                    if not block.startswith("robotid"):
-                        read(block)
-                    else:
-                        _parser(shlex.split(block)[1:]).parse_args(shlex.split(block)[1:])
-    assert typed > 30
+    every = [told(identified), *(told(identified, warning(code, delay=0.01)) for code in codes)]
+    steps = [step for found in every for o in (JOB, FLAGS) for step in next_steps(found, o)]
+    blocks = [block for step in steps for block in step.blocks]
+    for block in {*blocks}:
+        if block.startswith("robotid"):
+            _parser(shlex.split(block)[1:]).parse_args(shlex.split(block)[1:])
+        else:
+            read(block)
+    assert sum(block.startswith("robotid") for block in blocks) > 30
 
 
 #: Codes that name what is wrong with a joint, and the first words of their steps.
