@@ -407,6 +407,9 @@ def _of_fit(result: PositionIdentification, *, is_explained: bool) -> Iterator[F
     if left := [name for name in at_rest if name not in names]:
         yield _named("undetermined:rest", left)
     yield from _of_drives(result)
+    for x in () if result.loop.groups else result.fit.simulator.free_parameters:
+        if x.what == "armature" and len(x.joints) > 1:
+            yield finding("shared_drives", "", [result.model.joints[j] for j in x.joints])
     yield from _unequal_gains(result)
     yield from _encoder_findings(result)
     for tried in result.fit.tried:

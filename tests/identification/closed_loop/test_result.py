@@ -133,12 +133,11 @@ def test_speeds_of_a_log_are_those_between_its_gaps():
 def test_findings_of_the_fit_have_its_figures(found):
     details = {**found.estimate.details, "halving": 2.46, "step": 4e-3}
     scale = GainScale(np.array([0.2, 0.26]), np.array([0.05, 0.04]), 0.234, 0.0152)
-    tried = (
-        Tried("turn", ("stribeck", "load"), 0.316, is_chosen=True),
-        Tried("rail", ("load",), 0.5, is_chosen=False),
-    )
+    tried = [Tried("turn", ("stribeck", "load"), 0.316, True), Tried("rail", ("load",), 0.5, False)]
     own = of(found, details=details, converged=False, n_iter=17)
-    own = replace(own, fit=replace(own.fit, scale=scale, tried=tried))
+    first, *others = found.fit.simulator.free_parameters
+    shared = replace(own.fit.simulator, free_parameters=(replace(first, joints=(0, 1)), *others))
+    own = replace(own, fit=replace(own.fit, scale=scale, tried=tried, simulator=shared))
     said = {f.code: f for f in loop_findings(own, ())}
     assert "after 17 steps" in said["not_settled"].message
     assert "steps of 4 ms changes a parameter by 2.5" in said["coarse_steps"].message
@@ -150,10 +149,12 @@ def test_findings_of_the_fit_have_its_figures(found):
     friction = said["friction_found"]
     assert "turn: with stribeck and load" in friction.message
     assert friction.evidence == {"gain_pct": pytest.approx(31.6)}
-    assert said["scale"].severity == "note"
+    assert (said["scale"].severity, said["shared_drives"].where) == ("note", "rail, turn")
     quiet = of(found, details={**details, "halving": 0.99})
     codes = {f.code for f in loop_findings(quiet, ())}
-    assert not codes & {"not_settled", "coarse_steps", "gains_contradicted"}
+    assert not codes & {"not_settled", "coarse_steps", "gains_contradicted", "shared_drives"}
+    stated = replace(own, loop=replace(own.loop, groups={"drive": ["rail", "turn"]}))
+    assert "shared_drives" not in {f.code for f in loop_findings(stated, ())}
 
 
 NOISE = 1e-4  # [rad]
