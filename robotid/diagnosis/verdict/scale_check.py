@@ -341,6 +341,7 @@ def check_scale(fit: Fit) -> ScaleCheck:
     G = joint_torque_regressor(model, q, still, still).reshape(len(q), model.n_rows, -1)
     if model.loops:
         G = without_forces(loop_basis(model, q), G)
+    G[:, np.isin(model.row_names, model.passive)] = 0.0  # a torque that is 0 has no scale
     last = G[:, :, size - 10 : size - 6]  # m, mcx, mcy, mcz of the last body
     by_body, G = G[:, :, :size], G[:, :, fit.mapping.independent]
     at_rest = np.arange(len(fit.prior)) < size
@@ -350,8 +351,7 @@ def check_scale(fit: Fit) -> ScaleCheck:
     load = np.sum(of_urdf**2, axis=0)
     if not load.any():
         return plain
-    K = fit.mapping.K * at_rest
-    covariance = K @ fit.standard_covariance @ K.T
+    covariance = (K := fit.mapping.K * at_rest) @ fit.standard_covariance @ K.T
     gravity, error, known = {}, {}, []
     for j in np.flatnonzero(load > ZERO**2 * load.max()).tolist():
         w = of_urdf[:, j] @ G[:, j] / load[j]  # (b,), ratio = w beta

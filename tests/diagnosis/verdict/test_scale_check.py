@@ -105,7 +105,7 @@ def test_without_gravity_nothing_bears_witness(four):
     found = found_of(model, near_urdf(model))
     assert found.scale_check.scale is None
     assert not found.scale_check.agrees
-    assert "gravity loads no joint" in found.verdict.reasons[-1]
+    assert "gravity loads no driven joint" in found.verdict.reasons[-1]
 
 
 def test_a_result_that_its_prior_holds_back_bears_no_witness(four, rng):
