@@ -152,6 +152,7 @@ def follow(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     leave_out_meshes(monkeypatch)
     paths = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    number = r"[\\d.e-]+(?: to [\\d.e-]+)?"
     saved = re.compile(r"[Ss]ave (?:this|it) as `([\w.]+)`")
 
     def follow(page, brief="--seconds 0.5"):
@@ -174,7 +175,7 @@ def follow(tmp_path, monkeypatch, capsys):
                     subprocess.run(["bash", "-ec", line], env=os.environ | paths, check=True)
             printed += capsys.readouterr().out
             for line in block.splitlines() if language == "text" else ():
-                pattern = re.sub(r"\d+(\\\.\d+)?(e\\-\d+)?", r"[\\d.e-]+", re.escape(line.strip()))
+                pattern = re.sub(r"\d+(\\\.\d+)?(e\\-\d+)?", number, re.escape(line.strip()))
                 pattern = re.sub(r"(\\ )+", r"\\s+", pattern).replace(r"\.\.\.", "(?s:.*)")
                 assert re.search(pattern, printed), line
         return printed
