@@ -361,13 +361,14 @@ def loop_findings(
     # Bodies connect the joints: a cause that the logs show explains what the fit finds of others.
     settled, found = [_settled_delay(one, result) for one in examined], list[Finding]()
     causes = [one for one in settled if one.code in codes_with("names_cause")]
-    causes += (one for one in _of_drives(result) if one.code != "no_delay")
+    drives = [one for one in _of_drives(result) if not causes or one.code != "position_offset"]
+    causes += (one for one in drives if one.code != "no_delay")
     if result.has_gains and all(one.severity == "note" for one in causes):
         with suppress(NotConvergedError, DataError):  # a log that cannot be simulated, or is short
             found.extend(_other_gains(result))
         found.extend([] if causes or found else _valid_bands(result))
     of_fit = _of_fit(result, is_explained=bool(causes or found))
-    return by_severity([*settled, *of_fit, *found])
+    return by_severity([*settled, *drives, *of_fit, *found])
 
 
 def _of_fit(result: PositionIdentification, *, is_explained: bool) -> Iterator[Finding]:
@@ -406,7 +407,6 @@ def _of_fit(result: PositionIdentification, *, is_explained: bool) -> Iterator[F
     at_rest = [x.name for x in friction if not moves[list(x.joints)].any()]
     if left := [name for name in at_rest if name not in names]:
         yield _named("undetermined:rest", left)
-    yield from _of_drives(result)
     for x in () if result.loop.groups else result.fit.simulator.free_parameters:
         if x.what == "armature" and len(x.joints) > 1:
             yield finding("shared_drives", "", [result.model.joints[j] for j in x.joints])

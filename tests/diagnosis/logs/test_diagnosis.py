@@ -251,6 +251,8 @@ def test_a_drive_that_is_off_is_no_sign_of_its_torque(ur5, last, severity):
     assert found.evidence["ratio"] < 0.02
     if severity == "error":
         assert {f.code for f in findings if f.joints == found.joints} == {"drive_off"}
+        wrong = replace(log, tau=tau, q=log.q[:, [0, 1, 3, 2, 4, 5]])  # as the URDF's torque is
+        assert "drive_off" not in loud(diagnose(ur5, [wrong], [], SIGNALS))
 
 
 def test_a_recording_that_is_fitted_twice_is_named(ur5, short):

@@ -266,17 +266,18 @@ def test_a_delay_at_its_bound_leaves_the_warning_of_a_slow_command(found):
 def test_a_zero_that_position_and_command_do_not_share_is_named(leg, found):
     """A constant torque of a drive above all its other torques is kp times the difference."""
     drive, names = leg[0].drives[1], found.estimate.names
-    for offset, wanted in ((0.2, [0.2]), (-0.2, [-0.2]), (0.01, [])):
+    for offset, wanted in ((0.2, {drive.joint: 0.2}), (-0.2, {drive.joint: -0.2}), (0.01, {})):
         theta, away = found.estimate.theta.copy(), offset * np.eye(3)[1]
         theta[names.index(f"{drive.joint}.offset")] += drive.kp * offset
         runs = [replace(x, log=replace(x.log, q_ref=x.log.q_ref + away)) for x in found.fitted]
         fit = replace(found.fit, estimate=replace(found.estimate, theta=theta))
         other = replace(found, fit=fit, fitted=tuple(runs))
         other = replace(other, findings=loop_findings(other, ()))
-        named = {f.where: f for f in other.findings if f.code == "position_offset"}
-        assert [*named] == [drive.joint] * len(wanted)
-        assert [f.evidence["offset"] for f in named.values()] == pytest.approx(wanted, abs=0.01)
+        named = [f for f in other.findings if f.code == "position_offset"]
+        assert {f.where: f.evidence["offset"] for f in named} == pytest.approx(wanted, abs=0.01)
         assert (other.verdict.status == "good") == (not named)
+        explained = loop_findings(other, [replace(SLOW, code="command_sign")])
+        assert "position_offset" not in {f.code for f in explained}
 
 
 RATIOS = np.array([[1.0, 3.0, 1 / 3], [1.0, 2.0, 1 / 3]])  # of kp and kd
