@@ -185,8 +185,10 @@ class Postures:
         found, names = [], self.information.model.joints
         for kind, joint in np.argwhere((used > 1.0).any(axis=1)).tolist():
             own = used[kind, :, joint]
+            needed = 100.0 * own.min()  # in few digits however large it is
+            share = f"{needed:.0f}" if needed < 1e6 else f"{needed:.2g}"
             least = (
-                f"{names[joint]} needs at least {_percent(own.min())} % of its {LIMITS[kind]} "
+                f"{names[joint]} needs at least {share} % of its {LIMITS[kind]} "
                 "limit; set the robot's actual limits, or its actual payload"
             )
             some = f"{names[joint]} needs more than its {LIMITS[kind]} limit"
@@ -204,11 +206,6 @@ class Postures:
             some = f"{two} are nearer than {1e3 * wanted:.1f} mm"
             found.append((float(np.mean(margins[pair] < 0.0)), most, some))
         return found
-
-
-def _percent(share: float) -> str:
-    """Return a share in per cent, in few digits however large it is."""
-    return f"{100 * share:.0f}" if share < 1e4 else f"{100 * share:.2g}"
 
 
 @dataclass(frozen=True, eq=False)

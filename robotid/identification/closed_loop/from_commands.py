@@ -362,7 +362,7 @@ def loop_findings(
     settled, found = [_settled_delay(one, result) for one in examined], list[Finding]()
     causes = [one for one in settled if one.code in codes_with("names_cause")]
     drives = [one for one in _of_drives(result) if not causes or one.code != "position_offset"]
-    causes += (one for one in drives if one.code != "no_delay")
+    causes += (one for one in drives if one.code in codes_with("names_cause"))
     if result.has_gains and all(one.severity == "note" for one in causes):
         with suppress(NotConvergedError, DataError):  # a log that cannot be simulated, or is short
             found.extend(_other_gains(result))
@@ -407,9 +407,6 @@ def _of_fit(result: PositionIdentification, *, is_explained: bool) -> Iterator[F
     at_rest = [x.name for x in friction if not moves[list(x.joints)].any()]
     if left := [name for name in at_rest if name not in names]:
         yield _named("undetermined:rest", left)
-    for x in () if result.loop.groups else result.fit.simulator.free_parameters:
-        if x.what == "armature" and len(x.joints) > 1:
-            yield finding("shared_drives", "", [result.model.joints[j] for j in x.joints])
     yield from _unequal_gains(result)
     yield from _encoder_findings(result)
     for tried in result.fit.tried:
@@ -444,8 +441,7 @@ def _at_bound(result: PositionIdentification, *, is_explained: bool) -> Iterator
     """Yield which parameters are estimated at a bound, and what to do about it."""
     estimate, free_parameters = result.estimate, result.fit.simulator.free_parameters
     values = zip(free_parameters, estimate.theta.tolist(), strict=True)
-    largest = {free.name: free.highest for free, value in values if value >= free.highest}
-    if largest:
+    if largest := {free.name: free.highest for free, value in values if value >= free.highest}:
         yield _named("at_bound:largest", [f"{name} = {x:g}" for name, x in largest.items()])
     others = [x for x in free_parameters if x.name in {*estimate.details["at_bound"]} - {*largest}]
     least = [f"{x.name} = {x.lowest:.3g}" for x in others if x.what in POSITIVE]
@@ -515,8 +511,7 @@ def _valid_bands(result: PositionIdentification) -> Iterator[Finding]:
     """Yield up to which frequency the model predicts a joint whose position error is not small."""
     for run in result.validation or result.fitted:
         for j in np.flatnonzero(_relative_errors(run) > GOOD_POSITION).tolist():
-            band = run.valid_band(j)
-            if band is not None and 100.0 * band["below"] < GOOD_POSITION:
+            if (band := run.valid_band(j)) and 100.0 * band["below"] < GOOD_POSITION:
                 yield finding("model_bandwidth", run.log.name, result.model.joints[j], **band)
 
 
@@ -526,7 +521,7 @@ def _relative_errors(run: PositionEvaluation) -> Array:
 
 
 def _of_drives(result: PositionIdentification) -> Iterator[Finding]:
-    """Yield what the estimated limits, delays and offsets of the drives say."""
+    """Yield what limits, delays and offsets of the drives say, and which joints share a drive."""
     model, estimate, free = result.model, result.estimate, result.fit.simulator.free_parameters
     away = [run.log.q_ref - run.log.q for run in result.fitted if run.log.q_ref is not None]
     for x, value, error in zip(free, estimate.theta, estimate.std_error, strict=True):
@@ -538,6 +533,8 @@ def _of_drives(result: PositionIdentification) -> Iterator[Finding]:
         elif x.what == "delay" and (is_bound or value < -QUANTILE * error):
             code = "no_delay" if is_bound else "no_delay:early"
             yield finding(code, subject=x.name, delay=value)
+        elif x.what == "armature" and len(x.joints) > 1 and not result.loop.groups:
+            yield finding("shared_drives", "", [model.joints[j] for j in x.joints])
         elif x.term == TERMS["offset"] and result.has_gains:
             kp = float(result.fit.loops.kp[x.joints[0]])
             if abs(value) > np.sqrt(np.mean((kp * np.vstack(away)[:, x.joints] - value) ** 2)):

@@ -61,9 +61,8 @@ def limited(simulator):
         FreeParameter("calf.zero", "zero", (2,), 0.0, 0.3),
     )
     base = replace(simulator.base, limit=limit)
-    return replace(
-        simulator, base=base, free_parameters=simulator.free_parameters + free_parameters
-    )
+    free_parameters = simulator.free_parameters + free_parameters
+    return replace(simulator, base=base, free_parameters=free_parameters)
 
 
 def off(simulator, rng):
@@ -163,22 +162,19 @@ def test_torques_tell_gains_before_anything_is_fitted(told):
     moved = [measured_motion(window) for window in cut_windows(log, np.inf, 0.0)]
     open_ = replace(loops, kp=np.ones(2), kd=np.zeros(2), delay=np.zeros(2))
     is_free = np.ones((2, 2), dtype=bool)
-    lag, found = find_gains(moved, open_, is_free, knows_delay=False, is_whole=True)
+    how = {"knows_delay": False, "is_whole": True}
+    lag, found = find_gains(moved, open_, is_free, **how)
     np.testing.assert_array_equal(lag, [3, 3])
     np.testing.assert_allclose(found.kp, loops.kp, rtol=0.02)
     np.testing.assert_allclose(found.kd, loops.kd, rtol=0.05)
-    _, found = find_gains(
-        with_torques(moved, -log.tau), open_, is_free, knows_delay=False, is_whole=True
-    )
+    _, found = find_gains(with_torques(moved, -log.tau), open_, is_free, **how)
     np.testing.assert_array_equal(found.kp, open_.kp)  # no gain that would drive it away
     np.testing.assert_array_equal(found.kd, open_.kd)
     largest = np.abs(log.tau).max(axis=0)
     for share in ([0.4, 2.0], [2.0, 0.4]):  # the samples at the limit of their own joint are none
         limit = share * largest
         at_limit = with_torques(moved, np.clip(log.tau, -limit, limit))
-        _, found = find_gains(
-            at_limit, replace(open_, limit=limit), is_free, knows_delay=False, is_whole=True
-        )
+        _, found = find_gains(at_limit, replace(open_, limit=limit), is_free, **how)
         np.testing.assert_allclose(found.kp, loops.kp, rtol=0.02)
 
 
@@ -191,9 +187,8 @@ def test_what_drives_give_follows_commands_whole_or_broken_rows_late():
     window = Window(log, 0, 2, 8)
     out = RollOut(window, q[2:8], v[2:8])
     kp, kd, limit = np.array([3.0, 5.0]), np.array([0.7, 0.2]), np.array([2.0, np.inf])
-    loops = replace(
-        stated_loops(plant("planar", rng).model, LoopSettings()), kp=kp, kd=kd, limit=limit
-    )
+    loops = stated_loops(plant("planar", rng).model, LoopSettings())
+    loops = replace(loops, kp=kp, kd=kd, limit=limit)
     for lag in ([0.0, 1.0], [2.25, 0.5], [4.0, 1.75]):
         found = drive_torques(out, loops, np.array(lag))
         for j, late in enumerate(lag):
@@ -234,9 +229,8 @@ def test_starts_that_fit_are_nearer_to_the_truth_than_those_measured(rng):
     assert np.sqrt(np.mean(after**2)) < 0.5 * np.sqrt(np.mean(before**2))
     left = np.concatenate([r.e for r in better.residuals(measured.prior, with_slopes=False)])
     assert np.sqrt(np.mean(left**2)) < 1.2 * 3e-4
-    assert [(w.start_row, w.first, w.stop) for w in better.windows] == [
-        (w.start_row, w.first, w.stop) for w in measured.windows
-    ]
+    rows = [[(w.start_row, w.first, w.stop) for w in x.windows] for x in (measured, better)]
+    assert rows[0] == rows[1]
 
 
 def test_a_corrected_start_is_regularised_by_position_errors_and_the_typical_speed(rng):
@@ -285,9 +279,8 @@ def test_terms_are_scaled_by_half_the_range_of_a_joint_and_need_some_of_it(rng):
     model, t = plant("planar", rng).model, np.arange(200) / 100.0
     q = 0.3 + np.outer(np.cos(np.pi * t / 2), [0.4, 0.04])  # the second moves by less than 0.05
     log = Log(t, q, 0 * q, model.joints, q_ref=q, has_torque=False)
-    simulator = SimpleNamespace(
-        robot=SimpleNamespace(model=model), windows=cut_windows(log, 1.0, 0.0)
-    )
+    robot = SimpleNamespace(model=model)
+    simulator = SimpleNamespace(robot=robot, windows=cut_windows(log, 1.0, 0.0))
     offered = [free for set_ in candidates(simulator, np.array([2.0, 3.0])) for free in set_]
     by_position = [free for free in offered if isinstance(free.term, PositionCoulomb)]
     assert [free.joints for free in by_position] == [(0,), (0,)]

@@ -65,15 +65,13 @@ def test_an_initial_limit_is_the_friction_at_the_largest_speed_within_the_larges
         loops=SimpleNamespace(kp=np.array([30.0, 20.0]), limit=np.inf), inertia=one, torque=one,
         shows_inertia=one > 0, friction=friction.__getitem__,
     )  # fmt: skip
-    windows, has_gain = cut_windows(log, np.inf, 0.0), one > 0
+    robot, windows, has_gain = SimpleNamespace(model=model), cut_windows(log, np.inf, 0.0), one > 0
     of_errors = 0.8 * plain.loops.kp * more[0] * np.abs(q_ref - q)[windows[0].counted].max(axis=0)
     for top, wanted in (
         ([0.0, 0.0], of_errors),
         ([0.5, 0.5], [2.0, of_errors[1]]),  # the second would need more than it ever gave
     ):
-        found = typical_sizes(
-            SimpleNamespace(model=model), plain, windows, has_gain, np.array(top), ["a", "b"]
-        )
+        found = typical_sizes(robot, plain, windows, has_gain, np.array(top), ["a", "b"])
         np.testing.assert_allclose(found.largest, wanted)
 
 
