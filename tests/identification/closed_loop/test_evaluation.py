@@ -108,5 +108,4 @@ def test_errors_are_of_samples_in_windows_and_the_spread_is_about_the_mean(tmp_p
     np.testing.assert_allclose(found.baselines["urdf"], rms(soft, np.inf))
     assert found.baselines["second_order"] is None
     assert found.name == "log 5-7.49 s"
-    assert found.moves.tolist() == [True]
-    assert not found.is_driven
+    assert (found.moves.tolist(), found.is_driven) == ([True], False)
