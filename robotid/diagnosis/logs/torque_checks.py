@@ -279,6 +279,7 @@ def _reread(probe: Probe, share: Array, log: str) -> list[Finding]:
     from scipy.optimize import minimize_scalar
 
     joints, most = np.array(probe.model.joints), float(np.log(decisions.TENFOLD))
+    doubted = share + probe.uncertain  # errors of centres of mass look like zeros
 
     def read(x: float, joint: str, every: int = 1) -> Probe:
         m, speed = probe.motion, 1.0 if joint else float(np.exp(x))
@@ -286,7 +287,7 @@ def _reread(probe: Probe, share: Array, log: str) -> list[Finding]:
         return Probe.of(probe.model, m, probe.rows[::every])
 
     def misfit(x: float, joint: str) -> float:
-        return load_model(read(x, joint, _THINNED), share).misfit(1.0)
+        return load_model(read(x, joint, _THINNED), doubted).misfit(1.0)
 
     turning = [x for x in joints.tolist() if x not in probe.model.layout.prismatic]
     starts = [(joint, x, readings.OFFSET) for joint in turning for x in readings.QUARTERS]
@@ -303,7 +304,7 @@ def _reread(probe: Probe, share: Array, log: str) -> list[Finding]:
     values: dict[str, float | str] = {"what": "log", "cure": "masses", "also": False}
     values |= {"offset": best.x} if joint else {"speed": np.exp(-best.x)}
     one = finding(code, log, (joint,) * bool(joint), severity="warning", **values)
-    is_robot = load_model(after, share).is_this_robot()
+    is_robot = load_model(after, doubted).is_this_robot()
     rest = [] if is_robot else _reread(after, share, log)
     return [one, *rest] if is_robot or rest else []
 
