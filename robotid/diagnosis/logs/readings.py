@@ -519,12 +519,13 @@ def _best(samples: Samples) -> Best | None:
     gains = [(misfit(fewer.share) - misfit(r.of(fewer).share), i, r) for i, r in every]
     tried = sorted((x for x in gains if x[0] > _ALIKE), key=lambda x: -x[0])[:_TRIED]
     refined = [(r, r.of(samples), i) for _, i, x in tried for r in [x.refined(few, 8)]]
-    left = {r: (misfit(x.share), len(r.joints), i) for r, x, i in refined if x.is_possible}
+    left = {r: (misfit(x.share), i) for r, x, i in refined if x.is_possible}
     if not left:
         return None
     starts = {(r.code, r.joints): r for r in sorted(left, key=lambda r: left[r], reverse=True)}
     close = [r for r in starts.values() if left[r][0] < min(left.values())[0] + _ALIKE]
-    alike = sorted(close, key=lambda r: left[r][1:])  # the simplest first
+    near = few.changed(spread=few.motion.spread / _LOOSE)  # the simplest first, nearest the URDF
+    alike = sorted(close, key=lambda r: (len(r.joints), misfit(r.of(near).share), left[r][1]))
     best = alike[0].refined(few, 20)
     read = best.of(samples)
     gain = misfit(samples.held_out) - misfit(read.held_out)

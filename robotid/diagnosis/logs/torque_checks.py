@@ -304,7 +304,9 @@ def _reread(probe: Probe, share: Array, log: str) -> list[Finding]:
     values: dict[str, float | str] = {"what": "log", "cure": "masses", "also": False}
     values |= {"offset": best.x} if joint else {"speed": np.exp(-best.x)}
     one = finding(code, log, (joint,) * bool(joint), severity="warning", **values)
-    is_robot = load_model(after, doubted).is_this_robot()
+    whole = load_model(after, doubted)
+    chi, theta, _ = whole.fit()
+    is_robot = chi < decisions.BETTER * whole.expected and _error_of_links(theta) < _MISMATCH
     rest = [] if is_robot else _reread(after, share, log)
     return [one, *rest] if is_robot or rest else []
 
