@@ -373,9 +373,11 @@ def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
     for group in [*singles, *legs]:
         yield Reading("torque_sign", group, partial(_negated, on=one[list(group)].sum(axis=0)))
     for j in rows if is_gross or not legs else ():
-        yield Reading("joint_axis", (j,), lambda s, j=j: _negated(_multiplied(s, -2.0, j), one[j]))
+        yield Reading(
+            "joint_axis", (j,), lambda s, j=j: _negated(_multiplied(s, -2.0, (j,)), one[j])
+        )
         if j in turning:
-            yield Reading("position_sign", (j,), partial(_multiplied, more=-2.0, j=j))
+            yield Reading("position_sign", (j,), partial(_multiplied, more=-2.0, joints=(j,)))
     for group in (samples.unsigned, *zip(samples.unsigned, strict=True)):
         yield Reading("unsigned_torque", group, partial(_signed, joints=group))
     wrists = [tuple(rows[first:]) for first in range(1, len(rows) - 1)]
@@ -388,12 +390,13 @@ def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
         if m.basis is None and samples.urdf_size[at].any():  # by the ratio to the URDF's torques
             ratio = np.sum(m.tau[:, m.rows[at]] ** 2) / samples.urdf_size[at].sum()
             yield replace(scaled, values=(0.5 * float(np.log(ratio + EXACT)),))
+    for group in [(every, turning)] if m.basis is None else [((j,), (j,)) for j in turning]:
+        wide = partial(_multiplied, joints=tuple(group[1]))
+        yield from Reading("angle_scale", group[0], wide, (), 0.1).started(samples)
     for j in turning:
         shifted = Reading("position_offset", (j,), partial(_shifted, on=place[j]), (), 0.1)
         if m.basis is not None:
             yield from shifted.started(samples)
-            scaled = Reading("angle_scale", (j,), partial(_multiplied, j=j), (), 0.1)
-            yield from scaled.started(samples)
         else:
             for offset in (*QUARTERS[1:], OFFSET, -OFFSET):
                 yield replace(shifted, values=(offset,))
@@ -439,9 +442,9 @@ def _exchanged(samples: Samples, order: tuple[int, ...]) -> Samples:
 
 
 @lru_cache(maxsize=1)  # for two readings
-def _multiplied(samples: Samples, more: float, j: int) -> Samples:
-    """Return the samples with the motion of a joint multiplied by 1 + more."""
-    factor = 1.0 + more * (np.arange(samples.motion.v.shape[1]) == j)
+def _multiplied(samples: Samples, more: float, joints: tuple[int, ...]) -> Samples:
+    """Return the samples with the motion of joints multiplied by 1 + more."""
+    factor = 1.0 + more * np.isin(np.arange(samples.motion.v.shape[1]), joints)
     return _moved(samples, lambda x: factor * x)
 
 

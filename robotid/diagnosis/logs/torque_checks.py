@@ -126,10 +126,11 @@ def _finding(samples: Samples, one: Best, log: str) -> Finding:
     model, reading = samples.motion.model, one.reading
     names = [model.row_names[j] for j in reading.joints]
     worst = int(np.argmax(one.before - one.after))
-    others = [r for r in one.alike if r.joints]
+    others, of_whom = [r for r in one.alike if r.joints], "joint" if names else "robot"
+    what = of_whom if reading.code in ("gravity_compensated", "angle_scale") else "log"
     values: dict[str, float | str] = {
         "worst": model.row_names[samples.motion.rows[worst]], "before": one.before[worst],
-        "after": one.after[worst], "gain": one.gain, "what": "log", "cure": "log",
+        "after": one.after[worst], "gain": one.gain, "what": what, "cure": "log",
         "also": bool(others), "others": listed(
             f"{r.code} of {listed(model.row_names[j] for j in r.joints)}" for r in others
         ),
@@ -143,8 +144,6 @@ def _finding(samples: Samples, one: Best, log: str) -> Finding:
         values |= dict(zip(("best", "stated"), shown, strict=True)) | {"angle_deg": angle}
         values |= dict(zip("xyz", best.tolist(), strict=True))
         values["severity"] = "error" if angle > _WRONG_TILT else "warning"
-    elif reading.code == "gravity_compensated":
-        values["what"] = "joint" if names else "robot"
     elif reading.values:
         key = {"position_offset": "offset", "time_scale": "speed"}.get(reading.code, "factor")
         x = reading.values[0]
