@@ -395,14 +395,10 @@ def readings(samples: Samples, is_gross: bool) -> Iterator[Reading]:
         yield from Reading("angle_scale", group[0], wide, (), 0.1).started(samples)
     for j in turning:
         shifted = Reading("position_offset", (j,), partial(_shifted, on=place[j]), (), 0.1)
-        if m.basis is not None:
-            yield from shifted.started(samples)
-        else:
-            for offset in (*QUARTERS[1:], OFFSET, -OFFSET):
-                yield replace(shifted, values=(offset,))
+        zeros = (replace(shifted, values=(x,)) for x in (*QUARTERS[1:], OFFSET, -OFFSET))
+        yield from zeros if m.basis is None else shifted.started(samples)
     for j in turning if is_gross else ():
-        for turn in _quarters(model, j):
-            turned = model.with_turned_axis(model.row_names[j], *turn)
+        for turned in _quarters(model, j):
             yield Reading("axis_direction", (j,), lambda s, x=turned: s.changed(model=x))
 
 
@@ -456,13 +452,13 @@ def _moved(samples: Samples, change: Callable[[Array], Array]) -> Samples:
     return samples.changed(q=q, v=change(m.v), a=change(m.a))
 
 
-def _quarters(model: RobotModel, j: int) -> Iterator[tuple[Array, bool]]:
-    """Yield turns of a joint's axis by a quarter, and whether what it carries turns with it."""
+def _quarters(model: RobotModel, j: int) -> Iterator[RobotModel]:
+    """Yield robots with the axis of a joint turned by a quarter, alone or with what it carries."""
     axis = joint_constants(model.pin_model, model.pin_model.getJointId(model.row_names[j]))[-3:]
     for about, quarter, is_carried in product(np.eye(3), (1, -1), (False, True)):
         if abs(about @ axis) < 0.5:
             rotation = np.outer(about, about) + quarter * np.cross(about, np.eye(3))
-            yield rotation, is_carried
+            yield model.with_turned_axis(model.row_names[j], rotation, is_carried)
 
 
 def _signed(samples: Samples, joints: tuple[int, ...]) -> Samples:
@@ -527,8 +523,11 @@ def _best(samples: Samples) -> Best | None:
         return None
     starts = {(r.code, r.joints): r for r in sorted(left, key=lambda r: left[r], reverse=True)}
     close = [r for r in starts.values() if left[r][0] < min(left.values())[0] + _ALIKE]
-    near = few.changed(spread=few.motion.spread / _LOOSE)  # the simplest first, nearest the URDF
-    alike = sorted(close, key=lambda r: (len(r.joints), misfit(r.of(near).share), left[r][1]))
+    # the simplest first; of one kind, that which needs bodies nearest the URDF's
+    near = few.changed(spread=few.motion.spread / _LOOSE)
+    kind = {r.code: left[r][1] for r in sorted(close, key=lambda r: left[r][1], reverse=True)}
+    by_bodies = {r: misfit(r.of(near).share) for r in close}
+    alike = sorted(close, key=lambda r: (len(r.joints), kind[r.code], by_bodies[r]))
     best = alike[0].refined(few, 20)
     read = best.of(samples)
     gain = misfit(samples.held_out) - misfit(read.held_out)

@@ -195,27 +195,27 @@ class LoadModel:
         return np.concatenate([rows.reshape(-1, c + 1), prior])
 
 
-def load_model(probe: Probe, share: Array) -> LoadModel:
-    """Return the load model of a motion: share (n,)."""
+def load_model(probe: Probe, share: Array, doubt: Array | float = 0.0) -> LoadModel:
+    """Return the load model of a motion: shares of noise, and of errors that are no noise, (n,)."""
     (N, n), drives = probe.tau.shape, drive_columns(probe.model, probe.q, probe.v, probe.a)
     independent = min(_INDEPENDENT, _PER_SECOND * float(np.ptp(probe.motion.t[probe.rows])))
     bodies = probe.loads.shape[2]
     X = np.concatenate([probe.loads, probe.last_body, probe.tau[:, :, None]], axis=2)
     level = probe.tau.std(axis=0)
     used = (level > TINY * np.abs(probe.tau).max()) & (share < _UNEXPLAINED)
-    R = np.zeros((n, bodies + 5, bodies + 5))
+    R, variance = np.zeros((n, bodies + 5, bodies + 5)), decisions.AGREES**2 + share + doubt
     for j in np.flatnonzero(used).tolist():
         drive = drives[:, j]
         length = np.linalg.norm(drive, axis=0)
         U, s, _ = np.linalg.svd(drive / np.where(length > 0, length, 1.0), full_matrices=False)
         Q = U[:, s > TINY * s[0]]
         left = X[:, j] - Q @ (Q.T @ X[:, j])
-        sigma = np.sqrt(decisions.AGREES**2 + share[j]) * level[j]
+        sigma = np.sqrt(variance[j]) * level[j]
         R[j] = np.linalg.qr(left * np.sqrt(independent / N) / sigma, mode="r")
     mean = np.append(np.ones(bodies), np.zeros(4))
     arm = _mass(probe.model)  # a payload is of its size
     spread = np.append(np.full(bodies, _SPREAD), [arm, *[arm * probe.model.length] * 3])
-    expected = independent * float((share / (decisions.AGREES**2 + share))[used].sum())
+    expected = independent * float((share / variance)[used].sum())
     return LoadModel(R, mean, spread, expected, independent * float(used.sum()))
 
 
@@ -278,7 +278,7 @@ def _reread(probe: Probe, share: Array, log: str) -> list[Finding]:
     from scipy.optimize import minimize_scalar
 
     joints, most = np.array(probe.model.joints), float(np.log(decisions.TENFOLD))
-    doubted = share + probe.uncertain  # errors of centres of mass look like zeros
+    doubt = probe.uncertain  # errors of centres of mass look like zeros
 
     def read(x: float, joint: str, every: int = 1) -> Probe:
         m, speed = probe.motion, 1.0 if joint else float(np.exp(x))
@@ -286,7 +286,7 @@ def _reread(probe: Probe, share: Array, log: str) -> list[Finding]:
         return Probe.of(probe.model, m, probe.rows[::every])
 
     def misfit(x: float, joint: str) -> float:
-        return load_model(read(x, joint, _THINNED), doubted).misfit(1.0)
+        return load_model(read(x, joint, _THINNED), share, doubt).misfit(1.0)
 
     turning = [x for x in joints.tolist() if x not in probe.model.layout.prismatic]
     starts = [(joint, x, readings.OFFSET) for joint in turning for x in readings.QUARTERS]
@@ -303,9 +303,7 @@ def _reread(probe: Probe, share: Array, log: str) -> list[Finding]:
     values: dict[str, float | str] = {"what": "log", "cure": "masses", "also": False}
     values |= {"offset": best.x} if joint else {"speed": np.exp(-best.x)}
     one = finding(code, log, (joint,) * bool(joint), severity="warning", **values)
-    whole = load_model(after, doubted)
-    chi, theta, _ = whole.fit()
-    is_robot = chi < decisions.BETTER * whole.expected and _error_of_links(theta) < _MISMATCH
+    is_robot = load_model(after, share, doubt).is_this_robot()
     rest = [] if is_robot else _reread(after, share, log)
     return [one, *rest] if is_robot or rest else []
 
