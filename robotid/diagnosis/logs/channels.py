@@ -6,6 +6,7 @@ import numpy as np
 
 from robotid.base.findings import Finding, listed, quoted, toml_key
 from robotid.base.text import seconds
+from robotid.base.tolerances import TINY
 from robotid.base.typing import Array
 from robotid.data import units
 from robotid.data.base_motion import GAP_STEPS
@@ -153,9 +154,16 @@ def _stuck(log: Log) -> Iterator[Finding]:
         share, others = (last - first) / len(log.t), is_same[:, j].sum() - (last - first)
         if share < SHARE_OF_ROWS or others > ZERO * (last - first) or is_same[first:last].all():
             continue
-        q = log.q[max(first - _AROUND, 0) : first + 1, j]
-        if first >= _AROUND and 3 * abs(q[-1] - q[-4]) > BETTER * abs(q[-1] - q[0]):
+        if _stops(log.q[:, [j]], first):
             yield finding("stuck_position", log.name, joint, start=log.t[first], share=share)
+
+
+def _stops(q: Array, row: int) -> bool:
+    """Return whether positions that move stop at a row, without slowing down before."""
+    if row < _AROUND:
+        return False
+    late, whole = (np.linalg.norm(q[row] - q[row - k]) for k in (3, _AROUND))
+    return bool(3 * late > BETTER * whole)
 
 
 def _noise(log: Log, kind: str, values: Array, noise: Array) -> Iterator[Finding]:
@@ -372,9 +380,13 @@ def _rate(log: Log, step: Array, median: float) -> Iterator[Finding]:
     regular = step[step < GAP_STEPS * median]
     spread = float(np.std(regular)) / median
     if spread > AGREES:
+        even = _white_noise(median * np.arange(len(log.t)), log.q)
+        ratio = float(np.median(even / np.maximum(_white_noise(log.t, log.q), TINY)))
+        is_wrong = len(regular) == len(step) and ratio < BETTER  # than the motion at even times
         yield finding(
             "jitter", log.name, relative_spread=spread, shortest=float(step.min()),
-            longest=float(regular.max()), median=median,
+            longest=float(regular.max()), median=median, ratio=ratio, cure=is_wrong,
+            severity="warning" if is_wrong else "note",
         )  # fmt: skip
 
 
@@ -425,16 +437,19 @@ def _stale_rows(log: Log, step: Array) -> Iterator[Finding]:
         return
     lengths = [stop - start for start, stop in runs]
     share = sum(lengths) / len(log.t)
+    start, stop = runs[-1]
     yield finding(
         "stale_rows", log.name, severity="warning" if share > AGREES else "note",
-        rows=sum(lengths), share=share, longest_run=max(lengths),
+        rows=sum(lengths), share=share, longest_run=max(lengths), start=log.t[start],
+        what=stop < len(step), cure=stop < len(step),
     )  # fmt: skip
 
 
 def _in_motion(log: Log, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the runs of repeated rows within a motion that continues or catches up after them."""
+    """Return the runs of repeated rows within a motion, or after it if it stops there at once."""
     # After holding a position it starts from rest; a single encoder step is that of a slow motion.
     t, q, last_row = log.t, log.q, len(log.t) - 1
+    ends = [run for run in runs if run[1] == last_row and _stops(q, run[0])]
     first, last = np.array([run for run in runs if run[1] < last_row], dtype=int).reshape(-1, 2).T
     n = last - first + 1
     change = q[last + 1] - q[last]
@@ -447,7 +462,7 @@ def _in_motion(log: Log, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
         moves &= (np.abs(change) > 1.5 * steps).any(axis=1)
     continues = np.linalg.norm(change, axis=1) >= DIFFERS * around * n / m
     rows = np.flatnonzero(moves & continues)
-    return list(zip(first[rows].tolist(), last[rows].tolist(), strict=True))
+    return [*zip(first[rows].tolist(), last[rows].tolist(), strict=True), *ends]
 
 
 def check_torque_channels(log: Log) -> Iterator[Finding]:
