@@ -260,9 +260,10 @@ def explain_residual(
     unlike = unlike_log(sample) if is_one_robot else None
     every = explained.with_columns(_columns(misfits, sample)) if misfits else explained
     if unlike and unlike_log(every):  # no term or reading of all logs explains it
-        sample, between = _between(model, sample, unlike[0])
-        misfits, others = explain_residual(fit, sample, is_one_robot=False)
-        return misfits, (*between, *others)
+        separated, between = _between(model, sample, unlike[0])
+        if between:
+            misfits, others = explain_residual(fit, separated, is_one_robot=False)
+            return misfits, (*between, *others)
     unlike = unlike_log(every, friction=True) if is_one_robot else None
     friction = () if unlike is None else (_friction(sample, *unlike),)
     changing = tuple(_changing(model, sample, [x for x in table if x.changes], possible))
