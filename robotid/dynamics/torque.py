@@ -357,14 +357,15 @@ def body_slopes(model: RobotModel, pi: Array, trajectory: Trajectory) -> TorqueS
 
 
 def force_slopes(model: RobotModel, trajectory: Trajectory) -> Array:
-    """Return the derivatives of the torques by a force (3,) on the last body's tip, (N, n, 3)."""
+    """Return the derivatives of the torques by forces (3,) on the last joint and tip, (N, n, 6)."""
     engine, G = model.pin_model, model.velocity_map
     frames = [k for k, frame in enumerate(engine.frames) if frame.parentJoint == engine.njoints - 1]
     tip = max(frames, key=lambda k: np.linalg.norm(engine.frames[k].placement.translation))
-    slopes, data = np.empty((len(trajectory.q), len(G), 3)), engine.createData()
+    slopes, data = np.empty((len(trajectory.q), len(G), 6)), engine.createData()
     for D, q in zip(slopes, model.configurations(trajectory.q), strict=True):
-        J = pin.computeFrameJacobian(engine, data, q, tip, pin.LOCAL_WORLD_ALIGNED)
-        D[:] = -J[:3].T
+        for k, frame in enumerate((frames[0], tip)):
+            J = pin.computeFrameJacobian(engine, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
+            D[:, 3 * k : 3 * k + 3] = -J[:3].T
     return np.asarray(G.T @ slopes)
 
 

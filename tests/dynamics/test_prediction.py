@@ -212,7 +212,7 @@ def test_slopes_by_the_place_of_each_joint_are_those_of_differences(case, kind):
     assert np.abs(found).max() > (0.1 if kind == "origin" else 0.01)
 
 
-def test_the_slope_by_a_force_on_the_tip_is_that_of_the_virtual_work(case):
+def test_the_slopes_by_forces_on_joint_and_tip_are_those_of_the_virtual_work(case):
     model, pi, m = case
     engine, G = model.with_parameters(pi).pin_model, model.velocity_map
     last, data = engine.njoints - 1, engine.createData()
@@ -224,7 +224,7 @@ def test_the_slope_by_a_force_on_the_tip_is_that_of_the_virtual_work(case):
             ends = []
             for side in (push, -push):
                 pin.framesForwardKinematics(engine, data, pin.integrate(engine, q, side))
-                ends.append(data.oMf[tip].translation.copy())
+                ends.append(np.append(data.oMi[last].translation, data.oMf[tip].translation))
             np.testing.assert_allclose(by_force[j], -(ends[0] - ends[1]) / (2 * H), atol=1e-7)
 
 

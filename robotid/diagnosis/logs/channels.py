@@ -158,12 +158,12 @@ def _stuck(log: Log) -> Iterator[Finding]:
             yield finding("stuck_position", log.name, joint, start=log.t[first], share=share)
 
 
-def _stops(q: Array, row: int) -> bool:
-    """Return whether positions that move stop at a row, without slowing down before."""
+def _stops(q: Array, row: int, slow: float = 0.0) -> bool:
+    """Return whether positions that move faster than slow stop at a row, not slowing down."""
     if row < _AROUND:
         return False
     late, whole = (np.linalg.norm(q[row] - q[row - k]) for k in (3, _AROUND))
-    return bool(3 * late > BETTER * whole)
+    return bool(3 * late > max(BETTER * whole, 9 * slow))
 
 
 def _noise(log: Log, kind: str, values: Array, noise: Array) -> Iterator[Finding]:
@@ -449,7 +449,8 @@ def _in_motion(log: Log, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
     """Return the runs of repeated rows within a motion, or after it if it stops there at once."""
     # After holding a position it starts from rest; a single encoder step is that of a slow motion.
     t, q, last_row = log.t, log.q, len(log.t) - 1
-    ends = [run for run in runs if run[1] == last_row and _stops(q, run[0])]
+    usual = float(np.linalg.norm(np.diff(q, axis=0), axis=1).mean())
+    ends = [run for run in runs if run[1] == last_row and _stops(q, run[0], BETTER * usual)]
     first, last = np.array([run for run in runs if run[1] < last_row], dtype=int).reshape(-1, 2).T
     n = last - first + 1
     change = q[last + 1] - q[last]

@@ -303,7 +303,7 @@ def _reread(probe: Probe, share: Array, log: str) -> list[Finding]:
     values: dict[str, float | str] = {"what": "log", "cure": "masses", "also": False}
     values |= {"offset": best.x} if joint else {"speed": np.exp(-best.x)}
     one = finding(code, log, (joint,) * bool(joint), severity="warning", **values)
-    is_robot = load_model(after, share, doubt).is_this_robot()
+    is_robot = load_model(after, share, doubt / decisions.TENFOLD).is_this_robot()
     rest = [] if is_robot else _reread(after, share, log)
     return [one, *rest] if is_robot or rest else []
 

@@ -11,7 +11,7 @@ is none. A reading is an entry of ``readings``; ``Trials.accepted`` compares the
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from itertools import compress
 
 import numpy as np
@@ -142,17 +142,20 @@ def _of_robot(
         pulled = [_torques(model.with_gravity(axis), bodies, still) for axis in g * np.eye(3)]
         return np.stack(pulled, axis=2)
 
-    def push(on: Array) -> Array:
+    one, every = [(joint,) for joint in model.joints], [tuple[str, ...]()]
+
+    @cache
+    def push() -> Array:
         return np.concatenate([force_slopes(model, motion) for motion in at])
 
-    one, every = [(joint,) for joint in model.joints], [tuple[str, ...]()]
     level = every if down.any() else []
     return (
         Reading("gravity", 0.025, level, lambda on: by.by_gravity @ across.T, tilted),
         Reading("moving_gravity", 0.025, level, lambda on: g * by.by_gravity, changes=True),
         Reading("moving_gravity", 0.025, level, weighed, changes=True),
-        Reading("external_force", 0.0, every, push),
-        Reading("external_force", 0.0, every, push, changes=True),
+        Reading("external_force", 0.0, every, lambda on: push()[..., :3]),
+        Reading("external_force", 0.0, every, lambda on: push()[..., 3:]),
+        Reading("external_force", 0.0, every, lambda on: push()[..., 3:], changes=True),
         Reading("joint_origin", 0.01, one, lambda on: by.by_origin[:, :, on > 0].reshape(shape)),
         Reading(
             "axis_direction:residual", 0.03, one,

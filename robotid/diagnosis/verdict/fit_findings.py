@@ -118,7 +118,7 @@ def _drive_findings(fit: Fit) -> Iterator[Finding]:
         selected = [one for one in choice.tried if one.is_selected]
         for before, after in pairwise(selected):  # a late torque has the term -T d(tau)/dt
             explained = before.held_out_error_pct**2 - after.held_out_error_pct**2
-            if after.families[-1] == "lag" and explained > (100 * decisions.DIFFERS) ** 2:
+            if after.families[-1] == "lag" and explained > (100 * decisions.AGREES) ** 2:
                 k = fit.model.layout.names.index(f"{choice.joint}.lag")
                 sizes = {"size": fit.standard[k], "std_error": fit.standard_error[k]}
                 yield finding("joint_delay", "", choice.joint, explained=False, **sizes)
