@@ -516,13 +516,13 @@ def _best(samples: Samples) -> Best | None:
     fewer = few.changed(spread=spread)  # parameters: masses and first moments
     every = enumerate(readings(fewer, bool(few.share.max() > _GROSS)))
     gains = [(misfit(fewer.share) - misfit(r.of(fewer).share), i, r) for i, r in every]
-    tried = sorted((x for x in gains if x[0] > _ALIKE), key=lambda x: -x[0])[:_TRIED]
+    starts = {(r.code, r.joints): (gain, i, r) for gain, i, r in sorted(gains, key=lambda x: x[0])}
+    tried = sorted((x for x in starts.values() if x[0] > _ALIKE), key=lambda x: -x[0])[:_TRIED]
     refined = [(r, r.of(samples), i) for _, i, x in tried for r in [x.refined(few, 8)]]
     left = {r: (misfit(x.share), i) for r, x, i in refined if x.is_possible}
     if not left:
         return None
-    starts = {(r.code, r.joints): r for r in sorted(left, key=lambda r: left[r], reverse=True)}
-    close = [r for r in starts.values() if left[r][0] < min(left.values())[0] + _ALIKE]
+    close = [r for r in left if left[r][0] < min(left.values())[0] + _ALIKE]
     # the simplest first; of one kind, that which needs bodies nearest the URDF's
     near = few.changed(spread=few.motion.spread / _LOOSE)
     kind = {r.code: left[r][1] for r in sorted(close, key=lambda r: left[r][1], reverse=True)}

@@ -23,6 +23,7 @@ from robotid.data.log import REPEATED, Log, Trajectory, repeated_share
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.diagnosis.explanations import explained
+from robotid.diagnosis.logs.channels import check_clock
 from robotid.diagnosis.logs.check_logs import check_excitation, diagnose, findings_to_dict
 from robotid.diagnosis.urdf.inspection import inspect_urdf
 from robotid.dynamics.base_parameters import structural_mapping
@@ -179,6 +180,9 @@ READ = {
     "slow": (lambda m: (m, (x := recorded(m), replace(x, t=1.25 * x.t))[1]), {"time_scale": ()}),
     "two zeros": (lambda m: (m, (x := recorded(m), replace(x, q=x.q + SHIFT))[1]), {
         "position_offset": ("shoulder_lift_joint", "wrist_2_joint")}),
+    "parallel axes": (lambda m: (m, (x := recorded(with_other_bodies(m, np.random.default_rng(2))),
+        replace(x, q=x.q + 0.3 * np.eye(6)[2]))[1]), {"position_offset": ("elbow_joint",)}),
+    "wide": (lambda m: (m, (x := recorded(m), replace(x, q=1.1 * x.q))[1]), {"angle_scale": ()}),
     "axis": (lambda m: (m.with_turned_axis("elbow_joint", QUARTER, False), recorded(m)), {
         "axis_direction": ("elbow_joint",)}),
     "hung": (lambda m: (m, recorded(m, hung)), {"gravity": ()}),
@@ -197,9 +201,14 @@ def test_one_reading_explains_the_torques_of_a_plant_by_pinocchio(ur5, name):
     found = [f for f in diagnose(model, [log], [], SIGNALS) if f.severity != "note"]
     codes = {code: tuple(j for f in found if f.code == code for j in f.joints) for code in wanted}
     assert codes == wanted
-    assert {f.code for f in found} <= set(wanted) | {"excitation"}
-    sizes = {"speed": 0.8 if name == "slow" else 0.5, "offset": np.pi / 2, "factor": 0.02}
-    sizes |= {"angle_deg": np.degrees(0.35)}
+    assert {f.code for f in found} - {"excitation"} == set(wanted)
+    sizes = {"speed": 0.5, "offset": np.pi / 2, "factor": 0.02, "angle_deg": np.degrees(0.35)}
+    special = {
+        "slow": {"speed": 0.8},
+        "parallel axes": {"offset": 0.3},
+        "wide": {"factor": 1 / 1.1},
+    }
+    sizes |= special.get(name, {})
     for key, size in sizes.items():
         seen = [f.evidence[key] for f in found if key in f.evidence]
         assert seen == pytest.approx([size] * len(seen), rel=0.1)
@@ -269,6 +278,17 @@ def test_rows_that_are_stamped_on_arrival_have_no_other_fault(ur5, short):
     found = diagnose(ur5, [replace(short, t=t, assumed=("q in rad",))], [], SIGNALS)
     severities = {f.code: f.severity for f in found if f.severity != "note"}
     assert severities == {"bunched_stamps": "error", "log_assumption": "warning"}
+
+
+def test_stamps_that_are_not_those_of_the_rows_and_a_log_that_stops_are_named(ur5):
+    log, shift = controlled_log("ur5", 0), np.random.default_rng(0).uniform(-0.004, 0.004, 2001)
+    (found,) = (f for f in check_clock(replace(log, t=log.t + shift)) if f.code == "jitter")
+    assert (found.severity, found.evidence["ratio"] < 0.1) == ("warning", True)
+    last = np.minimum(np.arange(2001), 1400)
+    values = {"q": log.q[last], "v": None, "tau": log.tau[last]}
+    (found,) = (f for f in check_clock(replace(log, **values)) if f.code == "stale_rows")
+    assert (found.severity, found.evidence["rows"]) == ("warning", 600)
+    assert "cut the log with end = 14" in found.message
 
 
 def test_an_origin_in_millimetres_is_the_only_cause(short, tmp_path):

@@ -94,7 +94,8 @@ def test_what_differs_in_one_log_is_named_with_its_size(logs, change, where, siz
 
 def test_a_log_with_other_friction_or_another_offset_is_named(logs):
     typical = np.sqrt(np.mean(logs[1].tau ** 2, axis=0)) * np.eye(6)[2]
-    for change in (0.3 * logs[1].v / np.std(logs[1].v, axis=0), -0.3):
+    v = logs[1].v / np.std(logs[1].v, axis=0)
+    for change in (0.3 * v, -0.3, 0.3 * np.tanh(v / 0.05) * (0.8 + np.exp(-((v / 0.3) ** 2)))):
         other = replace(logs[1], tau=logs[1].tau + change * typical)
         for fitted, validation in (([logs[0], other], logs[2:]), (logs[:1], [other])):
             (found,) = differences(fitted, validation)
