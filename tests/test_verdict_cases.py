@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from helpers.paths import ROOT
 
+from robotid import doctor
+from robotid.data.files.read import write_columns
 from robotid.dynamics.torque import joint_torque_regressor
 
 sys.path.append(str(ROOT / "benchmarks"))
-from verdict_cases import ROBOTS, build, coupling, move, periodic, stribeck
+from verdict_cases import CASES, ROBOTS, build, coupling, make, move, periodic, stribeck
 
 
 @pytest.mark.parametrize("name", ["ur5", "kinova j2s6", "tiago", "planar 2R"])
@@ -32,3 +34,12 @@ def test_a_fault_of_the_plant_is_the_same_in_every_recording(fault):
     whole, piece = (fault(one, arm).tau - one.tau for one in (run, part))
     assert np.abs(whole).max() > 0
     np.testing.assert_allclose(piece, whole[300:500], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("joint", ["elbow_joint", "wrist_1_joint"])
+def test_of_parallel_axes_the_one_with_the_wrong_zero_is_named(joint, tmp_path):
+    table = make(ROBOTS["ur5"], CASES["clean, no dq"], (0, 3871452414, 2470987132), tmp_path).fitted
+    table[f"q_{joint}"] += 0.3
+    write_columns(table, path := tmp_path / "run.csv")
+    found = [f for f in doctor(ROBOTS["ur5"].path, path) if f.code == "position_offset"]
+    assert [f.joints for f in found] == [(joint,)]
