@@ -197,14 +197,10 @@ def verdict_html(robot: str, status: str, reasons: Sequence[str], uses: str = ""
         title = f"{len(items) - _FIRST} more reason{'s' if len(items) > _FIRST + 1 else ''}"
         more = f"<details><summary>{title}</summary><ul>{more}</ul></details>"
     return block(
-        "page.verdict",
-        kind=status.replace(" ", "-"),
-        robot=escape(robot),
-        status=status,
-        first="".join(items[:_FIRST]),
-        more=more,
+        "page.verdict", kind=status.replace(" ", "-"), robot=escape(robot), status=status,
+        first="".join(items[:_FIRST]), more=more,
         uses=f'<p class="uses">{escape(uses)}</p>' if uses else "",
-    )
+    )  # fmt: skip
 
 
 def facts_html(facts: Mapping[str, str], files: Mapping[str, str] | None = None) -> str:

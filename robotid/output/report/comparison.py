@@ -282,14 +282,11 @@ def comparison_page(content: Mapping[str, Any]) -> str:
 
 def _verdict(result: Mapping[str, Any]) -> str:
     return block(
-        "comparison.verdict",
-        status=escape(result["verdict"]["status"]),
-        label=result["label"],
-        name=escape(result["name"]),
-        estimator=escape(result["estimator"]),
+        "comparison.verdict", status=escape(result["verdict"]["status"]), label=result["label"],
+        name=escape(result["name"]), estimator=escape(result["estimator"]),
         path=code(result["path"]).html,
         reasons="".join(f"<li>{escape(reason)}</li>" for reason in result["verdict"]["reasons"]),
-    )
+    )  # fmt: skip
 
 
 def _columns(content: Mapping[str, Any], key: str, form: str, words: str = "{}") -> list[Column]:

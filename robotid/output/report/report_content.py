@@ -287,15 +287,10 @@ def worst_html(
     if worst is None:
         return ""
     return block(
-        "report.worst",
-        name=escape(worst.of.name),
-        start=f"{worst.start:.2f}",
-        end=f"{worst.end:.2f}",
-        rms=f"{worst.rms / scale:.3g}",
-        unit=unit,
-        ratio=f"{worst.ratio:.2g}",
+        "report.worst", name=escape(worst.of.name), start=f"{worst.start:.2f}", unit=unit,
+        end=f"{worst.end:.2f}", rms=f"{worst.rms / scale:.3g}", ratio=f"{worst.ratio:.2g}",
         link=dock.link("Show this second in the replay", worst.start, joint, worst.of.file),
-    )
+    )  # fmt: skip
 
 
 # ---- charts over time --------------------------------------------------------------------
@@ -368,19 +363,14 @@ def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "")
     entries = [entry for part in parameter_entries(found) for entry in part]
     worst, words = next(iter(worst_errors(counted))), block("report.torque_parameters")
     return Report(
-        title=f"{found.model.name}: identified parameters",
-        quantity=TORQUE,
-        counted=counted,
-        facts=_torque_facts(found),
+        title=f"{found.model.name}: identified parameters", quantity=TORQUE, counted=counted,
+        entries=entries, friction=_friction(found), bodies=tables.body_table(found),
+        facts=_torque_facts(found), why=why_section(found),
         made=f"<p>{escape(_torque_method(found))}</p>\n",
         errors=(block("report.torque_errors"), ""),
         curves=("Torques", _torques(found, worst, origin, replay)),
-        friction=_friction(found),
-        bodies=tables.body_table(found),
-        why=why_section(found),
         variation=tables.variation_section(found.variation, _next_errors(found)),
         parameters=tables.parameter_section(entries, words, found.on_misfit),
-        entries=entries,
         appendix={
             "drives": ("Selected friction terms", _selected_terms(found)),
             "base": ("Base parameters", tables.base_table(found)),
@@ -388,7 +378,7 @@ def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "")
             "open": ("Parameters not identifiable", tables.open_section(found)),
             **tables.sources_of(found),
         },
-    )
+    )  # fmt: skip
 
 
 def _next_errors(found: TorqueIdentification) -> dict[str, str]:
@@ -598,21 +588,18 @@ def position_report(found: "PositionIdentification", origin: Origin, replay: str
     source, kind = ("torque-driven simulation", "driven") if is_driven else ("commands", "position")
     worst = next(iter(worst_errors(counted)))
     return Report(
-        title=f"{found.model.name}: drives from {source}",
-        quantity=POSITION,
-        counted=counted,
-        facts=_position_facts(found),
+        title=f"{found.model.name}: drives from {source}", quantity=POSITION, counted=counted,
+        entries=entries, facts=_position_facts(found),
         made=f"<p>{escape(_position_method(found))}</p>\n",
         errors=(block(f"report.{kind}_errors", drift=f"{DRIFTS:g}"), _horizons(runs)),
         curves=("Positions", _positions(found, worst, kind, origin, replay)),
         parameters=tables.parameter_section(entries, block(f"report.{kind}_parameters")),
-        entries=entries,
         variation=tables.variation_section(found.variation, {}),
         appendix={
             "open": ("Parameters not identifiable", _open_section(found)),
             **tables.sources_of(found),
         },
-    )
+    )  # fmt: skip
 
 
 def _unit(run: PositionEvaluation) -> str:

@@ -175,14 +175,11 @@ def error_bars(
         words = f"{len(items) - VISIBLE} more joints with smaller errors"
         more = f"<details><summary>{words}</summary><ol>{more}</ol></details>\n"
     return block(
-        "report.bars",
-        title=quantity.title,
-        share=quantity.share,
+        "report.bars", title=quantity.title, share=quantity.share, more=more,
         kind="fitted samples, without validation log" if recordings[0].is_fitted else "not fitted",
         legend=_legend(quantity, {key for m in worst.values() for key in _others(quantity, m)}),
         bars="".join(items[:VISIBLE]),
-        more=more,
-    )
+    )  # fmt: skip
 
 
 def _others(quantity: Quantity, measured: Mapping[str, Any]) -> dict[str, float]:
@@ -438,13 +435,10 @@ def open_section(identification: TorqueIdentification) -> str:
         combinations = map(str, group.combinations)
         html += block("report.group", names=_codes(group.names), sums=_codes(combinations, "<br>"))
     return block(
-        "report.open",
-        rank=identification.determination.rank,
-        count=len(identification.base),
-        groups=html,
+        "report.open", rank=identification.determination.rank, count=len(identification.base),
+        groups=html, fixed=_codes(fixed),
         without_effect=_codes(identification.mapping.unidentifiable),
-        fixed=_codes(fixed),
-    )
+    )  # fmt: skip
 
 
 def _codes(names: Iterable[str], between: str = ", ") -> str:
