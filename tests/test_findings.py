@@ -240,7 +240,8 @@ def test_the_largest_or_the_smallest_stands_for_several_where_the_sentence_says_
              for log, size, rows in sizes]  # fmt: skip
     (message,) = grouped(found)[0].messages
     assert "a, b: tau of lift has spikes of up to 7.25 in 2 to 4 rows" in message
-    steps = [finding("jitter", log, shortest=low, longest=high, median=0.01, relative_spread=0.1)
+    figures = {"median": 0.01, "relative_spread": 0.1, "what": False, "cure": False}
+    steps = [finding("jitter", log, shortest=low, longest=high, **figures)
              for log, low, high in (("a", 0.008, 0.02), ("b", 0.009, 0.03))]  # fmt: skip
     assert "vary from 8 to 30 ms about 10 ms" in grouped(steps)[0].messages[0]
 

@@ -385,7 +385,7 @@ def _rate(log: Log, step: Array, median: float) -> Iterator[Finding]:
         is_wrong = len(regular) == len(step) and ratio < BETTER  # than the motion at even times
         yield finding(
             "jitter", log.name, relative_spread=spread, shortest=float(step.min()),
-            longest=float(regular.max()), median=median, ratio=ratio, cure=is_wrong,
+            longest=float(regular.max()), median=median, ratio=ratio, what=is_wrong, cure=is_wrong,
             severity="warning" if is_wrong else "note",
         )  # fmt: skip
 
