@@ -33,19 +33,11 @@ PACKAGES = {
 PLACES = [(package, part) for package, parts in PACKAGES.items() for part in parts]
 PINOCCHIO = {"robot", "dynamics", "output/viewer"}
 INSIDE_FUNCTIONS = {
-    "yourdfpy": {"robot"},
-    "meshcat": {"output/viewer"},
-    "trimesh": {"robot", "output/viewer"},
-    "pandas": {"identification"},
-    "pyarrow": {"data/files"},
-    "rosbags": {"data/files"},
-    "h5py": {"data/files"},
-    "distributed": {"estimation"},
-    "loky": {"estimation"},
-    "rich": {"cli"},
-    "coal": {"design"},
-    "matplotlib": set(),
-}
+    "yourdfpy": {"robot"}, "meshcat": {"output/viewer"}, "trimesh": {"robot", "output/viewer"},
+    "pandas": {"identification"}, "pyarrow": {"data/files"}, "rosbags": {"data/files"},
+    "h5py": {"data/files"}, "distributed": {"estimation"}, "loky": {"estimation"}, "rich": {"cli"},
+    "coal": {"design"}, "matplotlib": set(),
+}  # fmt: skip
 
 
 def modules():

@@ -196,23 +196,15 @@ def check():
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"joint": ["a"]},
-        {"joints": "a"},
-        {"gravity": [0.0, -9.81]},
-        {"gravity": [0.0, 0.0, -9.81, 0.0]},
-        {"locked": {"a": "here"}},
-        {"signals": {"velocity": "guessed"}},
-        {"signals": {"rate": "fast"}},
-        {"estimator": {"name": "magic"}},
-        {"estimator": {"prior_weight": "heavy"}},
-        {"estimator": {"constraints": {"masses": {}}}},
-        {"identification": [{"start": 1.0}]},
-        {"validation": LOG},
-        {"coupling": [{"name": "motor"}]},
-        {"reduction": {"workers": 2.5}},
+        {"joint": ["a"]}, {"joints": "a"}, {"gravity": [0.0, -9.81]},
+        {"gravity": [0.0, 0.0, -9.81, 0.0]}, {"locked": {"a": "here"}},
+        {"signals": {"velocity": "guessed"}}, {"signals": {"rate": "fast"}},
+        {"estimator": {"name": "magic"}}, {"estimator": {"prior_weight": "heavy"}},
+        {"estimator": {"constraints": {"masses": {}}}}, {"identification": [{"start": 1.0}]},
+        {"validation": LOG}, {"coupling": [{"name": "motor"}]}, {"reduction": {"workers": 2.5}},
     ],
     ids=lambda wrong: json.dumps(wrong),
-)
+)  # fmt: skip
 def test_what_a_job_refuses_is_invalid(check, wrong):
     job = {"urdf": "robot.urdf", "identification": [LOG]}
     check(job)

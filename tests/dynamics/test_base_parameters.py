@@ -14,21 +14,13 @@ from robotid.robot.parameters import Coupling
 
 ARM = {"panda.urdf": [f"panda_joint{i}" for i in range(1, 8)]}
 COUNTS = {
-    "ur3_robot.urdf": (36, None),
-    "ur5_robot.urdf": (36, None),
-    "ur10_robot.urdf": (36, None),
-    "panda.urdf": (43, None),
-    "xarm7.urdf": (43, None),
-    "talos_full_v2.urdf": (290, 318),
-    "a1.urdf": (68, 94),
-    "go2.urdf": (68, 94),
-    "solo12.urdf": (68, 94),
-    "hyq_no_sensors.urdf": (68, 94),
-    "g1_29dof_rev_1_0.urdf": (189, 213),
-    "tiago_pro.urdf": (195, None),
-    "pr2.urdf": (182, None),
+    "ur3_robot.urdf": (36, None), "ur5_robot.urdf": (36, None), "ur10_robot.urdf": (36, None),
+    "panda.urdf": (43, None), "xarm7.urdf": (43, None), "talos_full_v2.urdf": (290, 318),
+    "a1.urdf": (68, 94), "go2.urdf": (68, 94), "solo12.urdf": (68, 94),
+    "hyq_no_sensors.urdf": (68, 94), "g1_29dof_rev_1_0.urdf": (189, 213),
+    "tiago_pro.urdf": (195, None), "pr2.urdf": (182, None),
     "so100.urdf": (36, None),  # two more only through rpy="1.5708" and the like
-}
+}  # fmt: skip
 
 
 def count(path, **options):

@@ -278,18 +278,13 @@ ROWS = "0.0,1.0,2.0\n0.1,1.5,2.5\n"
 @pytest.mark.parametrize(
     "content",
     [
-        HEADER + ROWS,
-        ("\ufeff" + HEADER + ROWS),
-        (HEADER + ROWS).replace("\n", "\r\n"),
-        (HEADER + ROWS).rstrip("\n"),
-        HEADER + ROWS + "\n  \n",
-        (HEADER + ROWS).replace(",", ";"),
-        (HEADER + ROWS).replace(",", "\t"),
-        (HEADER + ROWS).replace(",", " , "),
+        HEADER + ROWS, ("\ufeff" + HEADER + ROWS), (HEADER + ROWS).replace("\n", "\r\n"),
+        (HEADER + ROWS).rstrip("\n"), HEADER + ROWS + "\n  \n", (HEADER + ROWS).replace(",", ";"),
+        (HEADER + ROWS).replace(",", "\t"), (HEADER + ROWS).replace(",", " , "),
         "# " + HEADER + ROWS,
         'mode,time,q_a,"tau_a"\n"a, b",0.0,1.0,2.0\n#c,0.1,"1.5",2.5\n',
     ],
-)
+)  # fmt: skip
 def test_csv_dialects(tmp_path, content):
     (tmp_path / "run.csv").write_bytes(content.encode())
     log = read_log(tmp_path / "run.csv", ["a"])

@@ -106,17 +106,10 @@ def test_a_row_of_weight_zero_is_as_if_it_had_never_been(make, states):
 
 THETA, ERROR = np.array([1.5, -20.0, 0.25]), np.array([0.1, 3.0, np.inf])
 ESTIMATE = Estimate(
-    theta=THETA,
-    covariance=np.diag(ERROR**2) + 0.01 * (1 - np.eye(3)),
-    names=("a.m", "b.viscous", "c.offset"),
-    sigma=np.ones(2),
-    rank=2,
-    condition=12.5,
-    undetermined=("c.offset",),
-    converged=True,
-    n_iter=3,
-    message="solved by hand",
-)
+    theta=THETA, covariance=np.diag(ERROR**2) + 0.01 * (1 - np.eye(3)), rank=2, condition=12.5,
+    names=("a.m", "b.viscous", "c.offset"), sigma=np.ones(2), undetermined=("c.offset",),
+    converged=True, n_iter=3, message="solved by hand",
+)  # fmt: skip
 
 
 def test_each_parameter_has_its_own_error_and_students_quantile():
