@@ -152,7 +152,7 @@ def follow(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     leave_out_meshes(monkeypatch)
     paths = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
-    number = r"[\\d.e-]+(?: to [\\d.e-]+)?"
+    number = r"[\\d.e-]+(?:\\s+to\\s+[\\d.e-]+)?"
     saved = re.compile(r"[Ss]ave (?:this|it) as `([\w.]+)`")
 
     def follow(page, brief="--seconds 0.5"):

@@ -162,8 +162,8 @@ def _stops(q: Array, row: int, slow: float = 0.0) -> bool:
     """Return whether positions that move faster than slow stop at a row, not slowing down."""
     if row < _AROUND:
         return False
-    late, whole = (np.linalg.norm(q[row] - q[row - k]) for k in (3, _AROUND))
-    return bool(3 * late > max(BETTER * whole, 9 * slow))
+    late, whole = (float(np.linalg.norm(q[row] - q[row - k])) for k in (3, _AROUND))
+    return 3 * late > max(BETTER * whole, 9 * slow)
 
 
 def _noise(log: Log, kind: str, values: Array, noise: Array) -> Iterator[Finding]:
