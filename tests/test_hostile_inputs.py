@@ -23,13 +23,9 @@ def test_no_input_gives_a_traceback(kind):
     strategy, run = KINDS[kind]
 
     @settings(
-        max_examples=EXAMPLES.get(kind, 8),
-        derandomize=True,
-        database=None,
-        deadline=None,
-        phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )
+        max_examples=EXAMPLES.get(kind, 8), derandomize=True, database=None, deadline=None,
+        phases=[Phase.generate], suppress_health_check=list(HealthCheck),
+    )  # fmt: skip
     @given(strategy)
     def try_one(example):
         with tempfile.TemporaryDirectory() as folder:

@@ -8,6 +8,7 @@ import pytest
 from helpers.paths import ROOT
 
 from robotid import doctor
+from robotid.cli.job import Job
 from robotid.data.files.read import write_columns
 from robotid.dynamics.torque import joint_torque_regressor
 
@@ -36,10 +37,18 @@ def test_a_fault_of_the_plant_is_the_same_in_every_recording(fault):
     np.testing.assert_allclose(piece, whole[300:500], rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("joint", ["elbow_joint", "wrist_1_joint"])
-def test_of_parallel_axes_the_one_with_the_wrong_zero_is_named(joint, tmp_path):
-    table = make(ROBOTS["ur5"], CASES["clean, no dq"], (0, 3871452414, 2470987132), tmp_path).fitted
-    table[f"q_{joint}"] += 0.3
-    write_columns(table, path := tmp_path / "run.csv")
-    found = [f for f in doctor(ROBOTS["ur5"].path, path) if f.code == "position_offset"]
-    assert [f.joints for f in found] == [(joint,)]
+@pytest.mark.parametrize(
+    ("robot", "key", "joint", "zero"),
+    [("ur5", 3871452414, "elbow_joint", 0.3), ("ur5", 3871452414, "wrist_1_joint", 0.3),
+     ("panda", 3305610995, "panda_joint4", -0.2), ("panda", 3305610995, "panda_joint4", 0.0)],
+)  # fmt: skip
+def test_zeros_beside_errors_of_masses_and_of_parallel_axes_are_named(
+    robot, key, joint, zero, tmp_path
+):
+    of = ROBOTS[robot]
+    made = make(of, CASES["clean, no dq"], (0, key, 2470987132), tmp_path)
+    made.fitted[f"q_{joint}"] += zero
+    write_columns(made.fitted, path := tmp_path / "run.csv")
+    model = Job(of.path, joints=of.joints, locked=made.arm.model.locked).model()
+    found = [f for f in doctor(model, path) if f.severity != "note"]
+    assert [(f.code, f.joints) for f in found] == [("position_offset", (joint,))] * bool(zero)

@@ -33,14 +33,10 @@ def job(ur5, rng, tmp_path):
             log = replace(log, q=q, v=v, a=None)
         write_log(log, tmp_path / "run.csv")
         return Job(
-            example_urdf("ur5_robot.urdf"),
-            joints=ur5.joints[:-1],
-            locked={} if stated is None else {HELD: stated},
-            identification=(LogEntry(tmp_path / "run.csv"),),
-            terms=DRIVE_TERMS,
-            report=False,
-            **options,
-        )
+            example_urdf("ur5_robot.urdf"), joints=ur5.joints[:-1], terms=DRIVE_TERMS,
+            locked={} if stated is None else {HELD: stated}, report=False,
+            identification=(LogEntry(tmp_path / "run.csv"),), **options,
+        )  # fmt: skip
 
     return make
 
