@@ -35,34 +35,27 @@ FAMILY = Rule(most=4, share=0.05, p_value=FAMILY_P_VALUE)
 # Families selected from simulated positions, one of each at most, by the share of a joint's squared
 # residual in held-out windows with unit noise: benchmarks/bench_commands.py
 SIMULATED_FAMILY = Rule(most=3, share=0.02, p_value=None, alike=0.0)
-#: Size over the torque above which a term is selected or reported: a smaller one may be an effect
-#: of the filter on velocity signs.
+#: Size over the torque above which a term is no effect of the filter on velocity signs.
 LEAST_TERM = 0.006
 #: p-value below which a family that is not selected is undecided: it widens intervals.
 UNDECIDED_P_VALUE = 0.25
 TENFOLD = 10.0  # Factor on a standard error above which a family is badly conditioned
-#: Distance from a bound, of the logarithm of its range, within which a shape is at the bound.
-AT_BOUND = 0.02
-#: Share of the squared residual that a missing term, a recording or URDF that differs, or a
-#: quantity must explain, and the largest p-value of that share.
+AT_BOUND = 0.02  # Distance of a shape at a bound from it, of the logarithm of its range
+#: Share of the squared residual that an option must explain, and the largest p-value of that share.
 LEAST_SHARE = 0.1
 P_VALUE = 3e-4
 # Terms that a drive model lacks: benchmarks/bench_misfit.py
 MISFIT = Rule(most=3, share=LEAST_SHARE, p_value=P_VALUE)
 MISFIT_WARNS = 0.25  # Share of the squared residual above which a term is a warning
 MISFIT_MATTERS = 0.02  # Size over the torque above which a term is a warning
-#: Share above which a coupling is reported although the other joint does not confirm it.
-ONE_SIDED = 0.6
+ONE_SIDED = 0.6  # Share above which a coupling needs no confirmation by the other joint
 CONFIRMED = 0.25  # Part of the share that validation logs must confirm, if there are any
-#: [%] of the squared residual: a term that explains more replaces a hypothesis of the doctor.
-MAIN = 50.0
-#: Factor on a standard error above which a parameter is reported as affected by a misfit.
-GROWN = 1.3
+MAIN = 50.0  # [%] of the squared residual that a term explains that replaces a hypothesis
+GROWN = 1.3  # Factor on a standard error above which a misfit affects a parameter
 # Recordings or URDF that differ from what was stated: benchmarks/bench_verdict.py. Only the best
 # hypothesis is tested.
 ALTERATION = Rule(most=3, share=-float("inf"), p_value=None)
-#: A smaller share is also reported if validation logs confirm it fully, its p-value is tiny and its
-#: size is twice the one that changes a result: it biases masses even if noise hides it.
+#: A smaller share counts if validation logs confirm it, its p-value is tiny and its size is large.
 WEAK = 0.03
 WEAK_P_VALUE = 1e-5
 WEAK_SIZE = 2.0
@@ -77,25 +70,19 @@ ROWS = 2000  # Instants of a motion that are used: more are not independent afte
 STEP = 1e-3  # Step of a derivative by a size, relative to a shape
 STEPS = 5  # Largest number of Gauss-Newton steps of sizes
 SETTLED = 0.2  # Step over its standard error below which sizes have converged
-#: Size of the correlation from which two parameters or signals are strongly correlated: if one were
-#: known, the error of the other would be less than a third of what it is, sqrt(1 - r^2) = 0.31.
+#: Strong correlation: if one were known, the other's error would be sqrt(1 - r^2) = 0.31 times.
 CORRELATED = 0.95
-#: Share of rows, of power, or of a torque from which it is most of it.
-MOST = 0.8
-#: Share of its largest or usual value below which a quantity is about 0.
-ZERO = 0.05
+MOST = 0.8  # Share of rows, of power, or of a torque from which it is most of it
+ZERO = 0.05  # Share of its largest or usual value below which a quantity is about 0
 #: Relative difference up to which two values agree: as a mass or a gravity torque confirms the
 #: torque scale; and from which one is reported, or a standard error is too large to use a value.
 AGREES = 0.05
 DIFFERS = 2 * AGREES
-#: Factor beyond which a torque or a total mass is no error of the URDF's masses, and a torque or
-#: a motion no error of its limits.
+#: Factor beyond which a torque, a mass or a motion is no error of the URDF's masses or limits.
 NO_ERROR_OF_MASSES = 3.0
-#: Ratio of the residuals of two explanations below which the first is clearly the better one.
-BETTER = 0.5
+BETTER = 0.5  # Ratio of two residuals below which the first explanation is clearly the better one
 SCATTERED = 3  # Segments from which a scatter is determined
-#: Share of a torque that is noise even in an exact log, and of the largest singular value that
-#: dependent columns leave.
+#: Share of a torque that is noise even in an exact log, and of what dependent columns leave.
 EXACT = 1e-5
 NOTHING = 1e-300  # A sum of squares that is 0, as a divisor
 Option = TypeVar("Option", bound=Hashable)

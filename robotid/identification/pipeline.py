@@ -21,7 +21,7 @@ from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.explanations import explained
 from robotid.diagnosis.residual.discrepancies import explain_residual
-from robotid.diagnosis.residual.misfit import settled
+from robotid.diagnosis.residual.misfit import clipped, settled
 from robotid.diagnosis.residual.term_trials import take_sample
 from robotid.diagnosis.urdf.inertials import (
     assumed_inertials,
@@ -123,6 +123,8 @@ def conclude(
     sample = take_sample(fit)
     units = sorted({log.unit for log in recordings.fitted})
     misfits, discrepancies = explain_residual(fit, sample, is_one_robot=len(units) == 1)
+    found = {(f.code, f.where) for f in doctor_findings}
+    discrepancies += (*(f for f in clipped(sample) if (f.code, f.where) not in found),)
     fit, on_misfit = with_model_error(fit, sample, misfits)
     names = [Path(e.recording.log.path).name for e in fit.fitted]
     fit = replace(fit, variation=vary(names, fit.runs, units))

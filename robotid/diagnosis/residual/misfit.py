@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from operator import attrgetter
 
 import numpy as np
@@ -80,6 +81,23 @@ def find_misfits(sample: Sample | None) -> tuple[Misfit, ...]:
         if not m.term.coupled
         or m.share > decisions.ONE_SIDED or (m.term.coupled, m.joint) in coupled
     )  # fmt: skip
+
+
+def clipped(sample: Sample | None) -> Iterator[Finding]:
+    """Yield torques that stay at their largest value where a larger one is predicted, by log."""
+    if sample is None or sample.weight.shape[1] > len(sample.joints):
+        return
+    tau, least = np.concatenate([motion.tau for motion in sample.at]), decisions.SHARE_OF_ROWS
+    names = np.repeat([x.log.name for x in sample.recordings], [len(k) for k in sample.taken])
+    for name, (j, joint) in product(dict.fromkeys(names.tolist()), enumerate(sample.joints)):
+        used = (names == name) & (sample.weight[:, j] > 0.0)
+        x, predicted = tau[used, j], tau[used, j] - sample.r[used, j] / sample.weight[used, j]
+        for sign in (1.0, -1.0) if used.any() else ():
+            limit = sign * np.quantile(sign * x, 1.0 - 0.5 * least)
+            beyond = sign * predicted > sign * limit
+            share, more = float(np.mean(beyond)), predicted[beyond]
+            if share > least and np.std(x[beyond]) < decisions.BETTER**2 * np.std(more):
+                yield finding("clipped", name, joint, limit=limit, share=share)
 
 
 def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:

@@ -133,16 +133,11 @@ def consistent_fit(choice: BoundedSettings, known: Known) -> Consistent:
     extent = body_boxes(model) if bounds.extent == "box" else {}
     bounds = replace(bounds, pinned=pinned_links(bounds, model))
     fit = Consistent(
-        layout=model.layout,
-        K=known.mapping.K,
-        prior=known.pi,
-        prior_std=known.spread,
-        held=held_parameters(model),
-        prior_weight=1.0 if isinstance(stated, str) else stated,
-        independent_share=known.share,
-        constraints=make_constraints(bounds, extent),
+        layout=model.layout, K=known.mapping.K, prior=known.pi, prior_std=known.spread,
+        held=held_parameters(model), prior_weight=1.0 if isinstance(stated, str) else stated,
+        independent_share=known.share, constraints=make_constraints(bounds, extent),
         wls_noise=known.sigma,
-    )
+    )  # fmt: skip
     folds = gather(known.held_out, FOLDS)
     how = {"auto": "cv"}.get(stated, stated) if isinstance(stated, str) else ""
     if how == "cv" and len(folds) < 2:

@@ -227,6 +227,18 @@ def test_columns_join_the_regressor_and_base_parameters_are_refitted(three):
         assert trial.left([0, 1])[left_out or 0] == pytest.approx(squares, rel=1e-6)
 
 
+@pytest.mark.parametrize("limit", [0.7, 1.1])
+def test_a_torque_that_stays_where_the_model_predicts_more_is_clipped(three, limit):
+    one, kept = logs_of(three, 1, duration=16.0)
+    tau, top = one.tau.copy(), limit * np.abs(one.tau[:, 1]).max()
+    noise = 0.02 * top * np.random.default_rng(0).standard_normal(len(tau))
+    tau[:, 1] = np.clip(tau[:, 1], -top, top) + noise
+    found = concluded(three, [replace(one, tau=tau), kept]).findings
+    limits = [(f.joints, f.evidence["limit"] / top) for f in found if f.code == "clipped"]
+    seen = {(joints, round(abs(x), 1)) for joints, x in limits}
+    assert seen == ({((LIFT,), 1.0)} if limit < 1 else set())
+
+
 def test_a_term_stands_for_what_the_doctor_guessed_of_its_torque(three):
     guesses = [
         Finding("urdf_mismatch", "warning", "run.csv", ""),
