@@ -24,7 +24,7 @@ class Rule:
     most: int  # Largest number of options selected
     share: float  # Smallest share of the squared residual of a selected option [-]
     p_value: float | None  # Largest p-value of a selected option [-]; None: it is not tested
-    #: Share of the squared residual within which options count as equal, the simpler is selected.
+    #: Share of the squared residual within which options count as equal.
     alike: float = 0.02
 
 
@@ -37,8 +37,7 @@ FAMILY = Rule(most=4, share=0.05, p_value=FAMILY_P_VALUE)
 SIMULATED_FAMILY = Rule(most=3, share=0.02, p_value=None, alike=0.0)
 #: Size over the torque above which a term is no effect of the filter on velocity signs.
 LEAST_TERM = 0.006
-#: p-value below which a family that is not selected is undecided: it widens intervals.
-UNDECIDED_P_VALUE = 0.25
+UNDECIDED_P_VALUE = 0.25  # p-value below which a family not selected is undecided: intervals widen
 TENFOLD = 10.0  # Factor on a standard error above which a family is badly conditioned
 AT_BOUND = 0.02  # Distance of a shape at a bound from it, of the logarithm of its range
 #: Share of the squared residual that an option must explain, and the largest p-value of that share.
@@ -52,8 +51,7 @@ ONE_SIDED = 0.6  # Share above which a coupling needs no confirmation by the oth
 CONFIRMED = 0.25  # Part of the share that validation logs must confirm, if there are any
 MAIN = 50.0  # [%] of the squared residual that a term explains that replaces a hypothesis
 GROWN = 1.3  # Factor on a standard error above which a misfit affects a parameter
-# Recordings or URDF that differ from what was stated: benchmarks/bench_verdict.py. Only the best
-# hypothesis is tested.
+# Recordings or URDF that differ: benchmarks/bench_verdict.py. Only the best hypothesis is tested.
 ALTERATION = Rule(most=3, share=-float("inf"), p_value=None)
 #: A smaller share counts if validation logs confirm it, its p-value is tiny and its size is large.
 WEAK = 0.03

@@ -95,9 +95,11 @@ def clipped(sample: Sample | None) -> Iterator[Finding]:
         for sign in (1.0, -1.0) if used.any() else ():
             limit = sign * np.quantile(sign * x, 1.0 - 0.5 * least)
             beyond = sign * predicted > sign * limit
-            share, more = float(np.mean(beyond)), predicted[beyond]
-            if share > least and np.std(x[beyond]) < decisions.BETTER**2 * np.std(more):
-                yield finding("clipped", name, joint, limit=limit, share=share)
+            if (share := float(np.mean(beyond))) > least:
+                slope = np.polyfit(predicted[beyond], x[beyond], 1)[0]
+                spread = np.std(x[beyond]) / np.std(predicted[beyond])
+                if abs(slope) < decisions.ZERO and spread < decisions.BETTER**2:
+                    yield finding("clipped", name, joint, limit=limit, share=share)
 
 
 def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
