@@ -31,23 +31,15 @@ SURE = 2.6  # standard errors, of a few hundred figures that are looked at
 SEEN = {"q": (-1.58, 1.80), "v": (0.03, 1.53)}  # of the elbow in this motion
 # Shapes, parameters, and what else the elbow has: sizes of some 2 N m beside 7 N m of torque.
 CASES = {
-    "load": ((), (0.07,)),
-    "stribeck": ((0.1,), (3.0,)),
-    "tanh": ((0.2,), (4.0,)),
-    "presliding": ((0.02,), (4.0,)),
-    "lag": ((), (0.01,)),
-    "harmonics1": ((), (2.0, 1.5)),
+    "load": ((), (0.07,)), "stribeck": ((0.1,), (3.0,)), "tanh": ((0.2,), (4.0,)),
+    "presliding": ((0.02,), (4.0,)), "lag": ((), (0.01,)), "harmonics1": ((), (2.0, 1.5)),
     "harmonics2": ((), (0.0, 0.0, 2.0, 1.5)),
     "harmonics4": ((), (0.0, 0.0, 2.0, 1.5, 1.0, -1.0, 0.5, -1.5)),
-    "asymmetric": ((), (1.5,)),
-    "power": ((0.35,), (3.0,)),
-    "cubic": ((), (1.0,)),
-    "curve": ((), (2.0, 1.5, 1.0, 0.5)),
-    "lugre": ((0.02, 0.15, 0.8), (3.0,)),
-    "position": ((), (1.0, 0.7)),
-    "spring": ((), (4.0,)),
+    "asymmetric": ((), (1.5,)), "power": ((0.35,), (3.0,)), "cubic": ((), (1.0,)),
+    "curve": ((), (2.0, 1.5, 1.0, 0.5)), "lugre": ((0.02, 0.15, 0.8), (3.0,)),
+    "position": ((), (1.0, 0.7)), "spring": ((), (4.0,)),
     "spring_table": ((), (2.0, 1.0, -1.0, -2.0, 1.0, 2.0, 3.0, 1.0)),
-}
+}  # fmt: skip
 ALIKE = {"tanh": {"tanh", "stribeck"}, "stribeck": {"tanh", "stribeck"}}
 
 

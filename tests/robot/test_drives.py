@@ -127,9 +127,7 @@ def test_only_what_physics_keeps_from_being_negative_is_bounded():
 
 # What each term is, written down a second time: of w, dw/dt, sign w, angle and load.
 EXPECTED = {
-    "armature": lambda m: m.a,
-    "viscous": lambda m: m.v,
-    "coulomb": lambda m: np.sign(m.v),
+    "armature": lambda m: m.a, "viscous": lambda m: m.v, "coulomb": lambda m: np.sign(m.v),
     "offset": lambda m: 1.0,
     "asymmetric": lambda m: np.abs(m.v),
     "load": lambda m: np.sign(m.v) * np.abs(m.load),

@@ -280,10 +280,22 @@ def test_rows_that_are_stamped_on_arrival_have_no_other_fault(ur5, short):
     assert severities == {"bunched_stamps": "error", "log_assumption": "warning"}
 
 
+@pytest.mark.parametrize(("joint", "seed"), [(2, 2), (3, 0)])
+def test_a_zero_competes_by_its_best_start(ur5, joint, seed):
+    pi, n = ur5.standard_parameters(), ur5.layout.n_inertial
+    pi[:n] *= np.repeat(np.random.default_rng(seed).choice([0.6, 1.5], n // 10), 10)
+    log = clean_log(ur5, seed, rate=50.0, duration=10.0, pi=pi)
+    (found,) = diagnose(ur5, [replace(log, q=log.q + 0.3 * np.eye(6)[joint])], [], SIGNALS)[:1]
+    assert (found.code, found.joints) == ("position_offset", (ur5.joints[joint],))
+
+
 def test_stamps_that_are_not_those_of_the_rows_and_a_log_that_stops_are_named(ur5):
     log, shift = controlled_log("ur5", 0), np.random.default_rng(0).uniform(-0.004, 0.004, 2001)
     (found,) = (f for f in check_clock(replace(log, t=log.t + shift)) if f.code == "jitter")
     assert (found.severity, found.evidence["ratio"] < 0.1) == ("warning", True)
+    gap = log.t + shift + 0.5 * (log.t > 10.0)  # equal steps are no explanation of a log with gaps
+    (found,) = (f for f in check_clock(replace(log, t=gap)) if f.code == "jitter")
+    assert found.severity == "note"
     last = np.minimum(np.arange(2001), 1400)
     values = {"q": log.q[last], "v": None, "tau": log.tau[last]}
     (found,) = (f for f in check_clock(replace(log, **values)) if f.code == "stale_rows")
