@@ -46,6 +46,7 @@ CHAINS = {"filtered": SignalSettings(), "raw": SignalSettings(cutoff=None)}
 NOISES = ("white", "unequal", "coloured")
 RATE, DURATION = 200.0, 24.0
 MOVED = 0.1  # [m]
+FRICTION = "viscous+coulomb"  # the plant's: one mapping for all runs
 ENCODER_NOISE = 0.01  # of each joint's torque
 ENCODER_ROBOTS = {"UR5": "ur5_robot.urdf"}
 
@@ -98,7 +99,9 @@ class Study:
             log = Log(
                 t=t, q=q, tau=tau + noise(kind, tau, draw), joints=self.model.joints, v=v, a=a
             )
-            identification = identify(self.model, [log], signals=CHAINS[chain], doctor=False)
+            identification = identify(
+                self.model, [log], signals=CHAINS[chain], friction=FRICTION, doctor=False
+            )
             truth = self.mapping.to_base(pi)
             reach = identification.errors.quantile
             wls, consistent = identification.wls, identification

@@ -123,8 +123,9 @@ def conclude(
     sample = take_sample(fit)
     units = sorted({log.unit for log in recordings.fitted})
     misfits, discrepancies = explain_residual(fit, sample, is_one_robot=len(units) == 1)
+    judged = (f for f in clipped(sample) if f.joints[0] not in model.passive)
     found = {(f.code, f.where) for f in doctor_findings}
-    discrepancies += (*(f for f in clipped(sample) if (f.code, f.where) not in found),)
+    discrepancies += tuple(f for f in judged if (f.code, f.where) not in found)
     fit, on_misfit = with_model_error(fit, sample, misfits)
     names = [Path(e.recording.log.path).name for e in fit.fitted]
     fit = replace(fit, variation=vary(names, fit.runs, units))

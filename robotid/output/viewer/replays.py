@@ -689,12 +689,9 @@ def page(data: Mapping[str, Any]) -> str:
     body = Template(asset("replay.html", _ASSETS)).substitute(
         title=escape(title),
         notes=" ".join(f"<p>{escape(note)}</p>" for note in data["notes"]),
-        data=script_json(data),
-        viewer=_viewer(),
-        uplot=asset("uPlot.iife.min.js"),
-        charts=asset("charts.js"),
-        script=_script(),
-    )
+        data=script_json(data), viewer=_viewer(), script=_script(),
+        uplot=asset("uPlot.iife.min.js"), charts=asset("charts.js"),
+    )  # fmt: skip
     head = f'<link rel="icon" href="data:,">\n<style>{style}</style>\n'
     return scaffold(title, head, body, policy=policy)
 
