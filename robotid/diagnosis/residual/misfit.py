@@ -94,7 +94,7 @@ def clipped(sample: Sample | None) -> Iterator[Finding]:
         x, predicted = tau[used, j], tau[used, j] - sample.r[used, j] / sample.weight[used, j]
         for sign in (1.0, -1.0) if used.any() else ():
             limit = sign * np.quantile(sign * x, 1.0 - 0.5 * least)
-            beyond = sign * predicted > sign * limit
+            beyond = sign * (predicted - limit) > decisions.AGREES * np.std(x)
             if (share := float(np.mean(beyond))) > least:
                 slope = np.polyfit(predicted[beyond], x[beyond], 1)[0]
                 spread = np.std(x[beyond]) / np.std(predicted[beyond])
