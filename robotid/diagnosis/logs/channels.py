@@ -163,7 +163,7 @@ def _stops(q: Array, row: int, slow: float = 0.0) -> bool:
     if row < _AROUND:
         return False
     late, whole = (float(np.linalg.norm(q[row] - q[row - k])) for k in (3, _AROUND))
-    return 3 * late > max(BETTER * whole, 9 * slow)
+    return late > max(BETTER * whole / 3, 3 * slow)
 
 
 def _noise(log: Log, kind: str, values: Array, noise: Array) -> Iterator[Finding]:

@@ -239,6 +239,15 @@ def test_a_torque_that_stays_where_the_model_predicts_more_is_clipped(three, lim
     assert seen == ({((LIFT,), 1.0)} if limit < 1 else set())
 
 
+def test_a_clipped_torque_that_the_doctor_names_is_not_named_again(three):
+    one, kept = logs_of(three, 1, duration=16.0)
+    top = 0.6 * np.abs(one.tau[:, 1]).max() * np.array([np.inf, 1.0, np.inf])
+    one = replace(one, tau=np.clip(one.tau, -top, top))
+    found = identify(three, [one], validation=[kept], friction="viscous+coulomb").findings
+    signs = [np.sign(f.evidence["limit"]) for f in found if f.code == "clipped"]
+    assert len({*signs}) == len(signs) > 0
+
+
 def test_a_term_stands_for_what_the_doctor_guessed_of_its_torque(three):
     guesses = [
         Finding("urdf_mismatch", "warning", "run.csv", ""),
